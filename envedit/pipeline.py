@@ -466,8 +466,12 @@ class _Edit:
 
     def _compared(self, rows, views=()):
         """Compare rows of the renderings with those of the target."""
-        initial, target, edited = (self.renders[name][rows] for name in ("initial", "target", "edited"))
+        renders = self.renders
         seen = None if self.scene.alpha is None else self.scene.alpha[rows] > 0
+        if photo := self.target.photo:
+            renders = {name: photo.displayed(picture) for name, picture in renders.items()}
+            seen = (photo.counts[..., 0] > 0) & (True if seen is None else seen)
+        initial, target, edited = (renders[name][rows] for name in ("initial", "target", "edited"))
         tonemap = self.settings.output.tonemap
 
         def compare(picture, other):

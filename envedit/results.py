@@ -121,6 +121,13 @@ class Result:
         """The rendering under the edited map, by Mitsuba with fresh samples."""
         return self.renders["edited"]
 
+    @property
+    def shown(self) -> dict[str, np.ndarray]:
+        """The renderings as pictures and measures show them: beside a photograph, as its camera does."""
+        if self.photo is None:
+            return self.renders
+        return {name: self.photo.displayed(picture) for name, picture in self.renders.items()}
+
     def __repr__(self) -> str:
         """Say in one line what was found: sizes, and how far the rendering is from the target."""
         height, width, _ = self.envmap.shape
@@ -137,7 +144,7 @@ class Result:
     def _repr_png_(self) -> bytes:
         """Show the renderings over their maps in a notebook."""
         views = [view.rows for view in self.views]
-        return preview.sheet(self.renders, self.maps, self._settings.output.tonemap, views)
+        return preview.sheet(self.shown, self.maps, self._settings.output.tonemap, views)
 
     @property
     def _settings(self) -> config.Config:
@@ -165,7 +172,7 @@ class Result:
             how = "run pip install '.[report]' in the checkout"
             raise MachineError(f"Result.plot: needs matplotlib, which is not installed: {how}") from None
         figure = Figure(figsize=(12, 6.5), layout="constrained")
-        rows = (self.renders, None), (self.maps, (0, 360, -90, 90))
+        rows = (self.shown, None), (self.maps, (0, 360, -90, 90))
         for axes, (pictures, extent) in zip(figure.subplots(2, 3), rows, strict=True):
             shown = preview.known(pictures)
             stops = preview.stops_of(shown.values())

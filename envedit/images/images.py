@@ -17,7 +17,7 @@ from envedit.core.atomic_files import replacing, write_atomically
 from envedit.core.errors import ConfigError, EnveditError, InputError, NumericalError, place_of
 from envedit.core.quiet_libraries import quiet_libraries
 from envedit.core.types import ArrayLike, FilePath, Info
-from envedit.images import exr, ldr, marks, rgbe
+from envedit.images import exr, ldr, marks, rgbe, tiff
 from envedit.images.headers import MAX_SIDE, damaged, head_of
 
 FORMATS = (
@@ -25,6 +25,8 @@ FORMATS = (
     ("hdr", b"#?", rgbe.read),
     ("png", b"\x89PNG\r\n\x1a\n", ldr.read),
     ("jpeg", b"\xff\xd8\xff", ldr.read),
+    ("tiff", b"II*\0", tiff.read),
+    ("tiff", b"MM\0*", tiff.read),
 )
 """Kind, first bytes and decoder of every format."""
 ARRAY = "array"
@@ -38,17 +40,17 @@ def read(path: FilePath) -> tuple[np.ndarray, dict]:
     """Read an image file as linear radiance.
 
     The content decides the format, not the name: OpenEXR (half, float or uint; any channel order; of layers
-    and parts that with the picture; luminance-only files become grey), Radiance HDR, and PNG or JPEG, whose
-    sRGB curve is undone. Marks of the file are honoured (:mod:`.marks`); what is transparent in a PNG is
-    dark. Values are as stored: they may be negative or not finite.
+    and parts that with the picture; luminance-only files become grey), Radiance HDR, and PNG, JPEG or TIFF,
+    whose sRGB curve is undone, but of a TIFF of floats. Marks of the file are honoured (:mod:`.marks`); what
+    is transparent in a PNG or TIFF is dark. Values are as stored: they may be negative or not finite.
 
     Returns
     -------
     image : array (H, W, 3) float32
         Linear radiance.
     info : dict
-        ``path`` (str), ``format`` ("exr", "hdr", "png" or "jpeg"), ``size`` (width, height), ``hdr`` (False
-        for 8- and 16-bit pictures, which have ``bits``), ``metadata`` (dict of str, int and float),
+        ``path`` (str), ``format`` ("exr", "hdr", "png", "jpeg" or "tiff"), ``size`` (width, height), ``hdr``
+        (False for 8- and 16-bit pictures, which have ``bits``), ``metadata`` (dict of str, int and float),
         ``chromaticities`` (of the file's colours; None: Rec. 709) and ``warnings`` (list of str). Of OpenEXR
         also ``half``: whether its values are.
 
@@ -57,6 +59,8 @@ def read(path: FilePath) -> tuple[np.ndarray, dict]:
     InputError
         If the file is missing, empty, truncated, of another kind, or declares more than 32768 texels on a
         side or 2^27 in all.
+    MachineError
+        If it is a TIFF and tifffile is not installed.
     """
     image, info = _decode(path, stored=False)
     return marks.in_rec709(image, info), info
@@ -68,9 +72,9 @@ def read_stored(path: FilePath) -> tuple[np.ndarray, dict]:
     Returns
     -------
     pixels : array (H, W, C)
-        float32 linear radiance for OpenEXR and Radiance; uint8 or uint16 codes of display values for PNG
-        and JPEG. C is 1 (grey), 2 (grey and alpha), 3 (RGB) or 4 (RGB and alpha). Alpha is premultiplied in
-        OpenEXR and straight in PNG, by convention.
+        float32 linear radiance for OpenEXR and Radiance; uint8 or uint16 codes of display values for PNG,
+        JPEG and TIFF. C is 1 (grey), 2 (grey and alpha), 3 (RGB) or 4 (RGB and alpha). Alpha is
+        premultiplied in OpenEXR and straight in PNG, by convention.
     info : dict
         As of :func:`read`; ``metadata`` holds a PNG's texts. A JPEG also has ``quality``, as libjpeg
         counts it, estimated from its first table.
@@ -102,7 +106,7 @@ def _decode(path, stored, space=marks.AUTO):
                 raise damaged(name, f"{type(e).__name__}: {e}") from None
             info["size"] = (image.shape[1], image.shape[0])
             return image, info
-    raise InputError(f"{name}: not an image envedit can read; use OpenEXR or Radiance HDR (or PNG, JPEG)")
+    raise InputError(f"{name}: not an image envedit can read; use OpenEXR or Radiance (or PNG, JPEG, TIFF)")
 
 
 def is_panorama(path: FilePath) -> bool:

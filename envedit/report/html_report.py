@@ -41,7 +41,7 @@ def write_report(path: FilePath, result: Result, settings: config.Config, manife
     metrics = plain(result.metrics, "metrics", lost)
     plain(result.history, "history", lost)
     tonemap = settings.output.tonemap
-    renders = preview.known(result.renders)
+    renders = preview.known(result.shown)
     maps = preview.known(result.maps)
     names = list(dict.fromkeys([*result.renders, *result.maps]))
     by_view = _by_view(renders, result.views)

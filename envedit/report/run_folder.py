@@ -59,7 +59,7 @@ def write(
     if settings.output.report:
         preview.preview(
             folder / "preview.png",
-            result.renders,
+            result.shown,
             result.maps,
             settings.output.tonemap,
             views=[view.rows for view in result.views],

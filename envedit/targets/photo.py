@@ -212,6 +212,12 @@ class Photo:
         """Return what the camera shows of a rendering (h, w, 3) less the photograph's values."""
         return self.camera.shown(rendering) - self.values
 
+    def displayed(self, radiance: np.ndarray) -> np.ndarray:
+        """Return the light of a display, white at 1, on which the camera shows radiance (h, w, 3)."""
+        shown = self.camera.shown(radiance)
+        light = shown if self.camera.curve == "linear" else srgb_to_linear(shown)
+        return np.asarray(light, np.float32)
+
     def exposed_by(self, log_factor: np.ndarray) -> Photo:
         """Return it with a camera whose log factor is larger by (3,)."""
         camera = replace(self.camera, log_factor=self.camera.log_factor + log_factor)

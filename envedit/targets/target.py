@@ -356,7 +356,7 @@ def _seen(target, hidden, curve):
     white = (apply_tonemap(target.picture, curve) >= 1).all(axis=2)
     counted = white if hidden is None else white & ~hidden
     share = counted.sum() / (white.size if hidden is None else max((~hidden).sum(), 1))
-    if share > MOST_WHITE:
+    if share > MOST_WHITE and target.photo is None:
         said = f"target: {100 * share:.3g} % of its pixels are white under the tonemap '{curve}', where "
         said += "measures and pictures show no difference: lower scene.scale, or set another output.tonemap"
         target = replace(target, warnings=(*target.warnings, said))

@@ -13,6 +13,7 @@ from envedit.core.color import luminance
 from envedit.core.tone_curves import TONE_CURVES
 from envedit.export.adjustments import balance
 from envedit.targets.alignment import Placement
+from envedit.targets.photo import Camera
 
 PHOTO_SIZE = 3
 """Pixels of the photograph for one of the rendering, along each axis."""
@@ -48,8 +49,8 @@ CAMERAS = (
 )
 
 
-def photograph(model: Model, scene: config.Scene, envmap: np.ndarray, seed: int, file: Path) -> float:
-    """Write the photograph of a scene under a map (H, W, 3); returns its exposure in stops."""
+def photograph(model: Model, scene: config.Scene, envmap: np.ndarray, seed: int, file: Path) -> Camera:
+    """Write the photograph of a scene under a map (H, W, 3), and return its camera."""
     # ---- Path traced, metered and exposed
     film = inputs.load_scene(replace(scene, width=PHOTO_SIZE * scene.width))
     radiance = film.render(np.ascontiguousarray(envmap, np.float32), SPP, seed)
@@ -68,4 +69,4 @@ def photograph(model: Model, scene: config.Scene, envmap: np.ndarray, seed: int,
     electrons = rng.poisson(ELECTRONS * exposed) + rng.normal(0, READ_NOISE, exposed.shape)
     shown = TONE_CURVES[model.curve].shown(np.maximum(electrons / ELECTRONS, 0))
     mi.Bitmap(np.rint(255 * shown).astype(np.uint8)).write(str(file), quality=JPEG_QUALITY)
-    return float(np.log2(luminance(factor)))
+    return Camera(model.curve, np.log(factor))

@@ -14,7 +14,7 @@ from envedit.core.tone_curves import TONE_CURVES
 from envedit.images import images
 from envedit.targets.strokes import gains
 from tests.oracles.builders import LIGHT, write_scene
-from tests.oracles.painting import OF_TWO, SMALL, TWO_VIEWS, served, until
+from tests.oracles.painting import OF_TWO, SMALL, TWO_VIEWS, photographed, served, until
 
 pytestmark = pytest.mark.slow
 sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
@@ -451,4 +451,24 @@ def test_views_as_tabs_names_focus_order_and_contrast(browser, tmp_path):
         order = ["save", "tool-light", "shape-brush", "softness", "view-1", "overlay", "handle-1",
                  "tool-turn", "map-exposure"]  # fmt: skip
         assert [name for name in reached if name in order] == order, reached
+        assert not page.faults, page.faults
+
+
+def test_a_photograph_is_compared_with_the_rendering(browser, tmp_path):
+    with served(photographed(tmp_path)) as server:
+        page = Page(browser, server.url)
+        get = page.page.get_by_test_id
+        sync_api.expect(get("reference")).to_have_value("2")
+        page.settled(False)
+        matched = page.picture("render")
+        get("split").fill("0.5")
+        page.shot("photograph")
+        get("split").fill("1")
+        photograph = page.picture("render")
+        assert photograph != matched
+        get("list-mute-1").click()
+        page.settled(False)
+        assert page.picture("render") == photograph, "the photograph follows the edit"
+        get("reference").select_option("0")
+        assert page.picture("render") != photograph
         assert not page.faults, page.faults

@@ -10,7 +10,7 @@ from envedit.cli.paint import project
 from envedit.cli.paint.protocol import Edit, Pick, document
 from envedit.cli.paint.session import Session, Tell
 from envedit.core.rotations import rotation_vector
-from tests.oracles.painting import SMALL
+from tests.oracles.painting import SMALL, photographed
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("own_core")]
 ERASED = {"type": "erase-shadow", "ellipse": [0.62, 0.3, 0.12, 0.12], "softness": 0.05}
@@ -20,10 +20,13 @@ DRAGGED = {0.0: ((33, 10), (41, 10)), 40.0: ((40, 8), (31, 8))}
 
 
 class Heard(Tell):
-    """Keeps the last message of each kind."""
+    """Keeps the last message, and the last image, of each kind."""
 
     def __init__(self):
-        self.last = {}
+        self.last, self.images = {}, {}
+
+    def frame(self, kind, source, image, rows=(slice(None),)):
+        self.images[kind] = image
 
     def say(self, message):
         self.last[message["type"]] = message
@@ -144,3 +147,21 @@ def test_a_shadow_is_dragged_by_its_tip(painting):
         session.run.state["turn"][0] = rotation_vector(lights.centres[0], lights.centres[0] * [-1, 1, -1])
         assert "in no shadow" in picked(*there)["text"], "the light is not where paint has put it"
         assert "no shadow was picked" in picked(45, 45, light=0)["text"]
+
+
+def test_the_light_of_a_photograph_is_painted_on_beside_it(tmp_path):
+    """It is found once; the photograph is shown in the scene's radiance, as the rendering is."""
+    file, heard = photographed(tmp_path), Heard()
+    session = Session(project.opened(str(file)), heard)
+    session.again()
+    shown, rendering = heard.images["photograph"], heard.images["before"]
+    assert np.corrcoef(shown.ravel(), rendering.ravel())[0, 1] > 0.95
+    assert np.median(shown / rendering) == pytest.approx(1, abs=0.1)
+
+    light = {"light": 1, "flux": [2.0, 2.0, 2.0]}
+    session.update(Edit(document({"lights": [light]})))
+    again = project.opened(str(file))
+    assert again.photo is None and len(again.document.lights) == 1, "the light was looked for again"
+
+    photographed(tmp_path, azimuth=200)
+    assert project.opened(str(file)).photo is not None, "another photograph was taken for this one"

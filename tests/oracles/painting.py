@@ -26,6 +26,30 @@ spp = 16
 report = false
 """
 
+PHOTO = SMALL.replace(
+    "[target]", '[target]\nkind = "photo"\nfile = "photo.png"\ncurve = "srgb"\nalign = false'
+)
+PHOTO = PHOTO.replace("width = 48", "width = 24")
+PHOTO += "[representation]\nturn = false\n[optimizer]\niterations = 1\n"
+"""A photograph ``photo.png`` of the scene of :data:`SMALL`, for :func:`photographed`."""
+
+
+def photographed(folder, azimuth=150):
+    """Write :data:`PHOTO`, with the photograph under another sun, to a folder; returns the configuration."""
+    import numpy as np
+
+    import envedit
+    from envedit.images import images
+    from envedit.targets.photo import Camera
+
+    true = envedit.load_scene("sphere", width=24).render(
+        envedit.sunsky(64, azimuth=azimuth, elevation=30), spp=64
+    )
+    images.write_png(folder / "photo.png", Camera("srgb", np.log([1.5, 1.2, 0.8])).shown(true))
+    (folder / "edit.toml").write_text(PHOTO)
+    return folder / "edit.toml"
+
+
 _CAMERA = """<sensor type="perspective" id="{name}"><float name="fov" value="30"/>
 <transform name="to_world"><lookat origin="0,1,{z}" target="0,0,0" up="0,1,0"/></transform>
 <film type="hdrfilm"><integer name="width" value="32"/>

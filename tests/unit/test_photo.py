@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from envedit import config
+from envedit.core.color import srgb_to_linear
 from envedit.core.errors import ConfigError, InputError
 from envedit.core.tone_curves import TONE_CURVES
 from envedit.images import images
@@ -46,6 +47,8 @@ def test_exposure_and_white_balance_are_found_under_the_right_curve(lit, tmp_pat
     seen = ~found.photo.clipped & (found.photo.values > 0.1)
     assert seen.mean() > 0.3
     np.testing.assert_allclose(found.picture[seen], lit[2][seen], rtol=0.1)
+    displayed = found.photo.displayed(found.picture)
+    np.testing.assert_allclose(displayed[seen], srgb_to_linear(found.photo.values)[seen], rtol=1e-3)
 
 
 def test_what_is_given_of_the_camera_stays(lit, tmp_path):

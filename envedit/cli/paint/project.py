@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
@@ -16,6 +17,8 @@ from envedit.core.errors import ConfigError, InputError
 
 NAME, SOLUTION = "painted.toml", "painted.npz"
 """Files of a painting: what was painted, and the solution that was saved last."""
+MATCHED = "matched.exr"
+"""The map that explains a photograph, in the folder of the run that has found it."""
 _RECENT = 12
 
 
@@ -37,6 +40,8 @@ class Project:
         Whether ``painted.toml`` was there already.
     start : str
         File of the solution that was saved of the document, "" where it has changed since.
+    photo : config.Config, optional
+        The run that makes the map: it matches a photograph. None without one, and where it is done.
     """
 
     settings: config.Config
@@ -45,6 +50,7 @@ class Project:
     document: Document
     again: bool = False
     start: str = ""
+    photo: config.Config | None = None
 
     def configured(self, document: Document, start: str = "") -> config.Config:
         """Return the configuration that makes the map of a document; arguments as of :meth:`text`."""
@@ -176,12 +182,29 @@ def opened(name: str, envmap: str = "", preset: str | None = None, camera: str =
         rest=settings.target.rest,
         freedom=settings.solve.freedom,
     )
+    if settings.target.kind == "photo":
+        return _continued(_of_photo(settings, base))
     painted = file is not None and file.name == NAME
     folder = file.absolute().parent if file and painted else Path(settings.output.dir)
     plain = _plain(settings, folder)
     if painted:
         return Project(plain, folder, base, document, True, settings.optimizer.start)
     return _continued(Project(plain, folder, base, document))
+
+
+def _of_photo(settings, base):
+    """Return a project on the map that explains a photograph, which one run makes for each photograph."""
+    files = *settings.target.files, *settings.target.masks
+    read = [atomic_files.digest(file) for file in files if Path(file).is_file()]
+    key = hashlib.sha256(b"".join([config.to_toml(settings).encode(), *read])).hexdigest()[:8]
+    folder = Path(settings.output.dir)
+    matched = folder / f"photograph-{key}" / MATCHED
+    photo = replace(settings, output=_without(settings.output, dir=str(matched.parent), format="exr"))
+    given = settings.input
+    kept = {name: getattr(given, name) for name in ("width", "rows", "horizon") if name in given.given}
+    plain = _plain(replace(settings, lights=config.Lights()), folder)
+    plain = replace(plain, input=config.Input(envmap=str(matched), **kept))
+    return Project(plain, folder, base, Document(), photo=None if matched.exists() else photo)
 
 
 def _path(envmap):

@@ -25,7 +25,9 @@ MOST_BYTES = 1 << 20
 """Length of a message from the page."""
 MOST_STROKES, MOST_POINTS = 500, 20_000
 """Of a document: what is more would take seconds to paint."""
-KINDS = ("render", "map", "difference", "unreachable", "before", "explanation", "sky", "sky-before")
+KINDS = (
+    "render", "map", "difference", "unreachable", "before", "explanation", "sky", "sky-before", "photograph",
+)  # fmt: skip
 SOURCES = ("transport", "mitsuba", "saved")
 PHASES = ("drawing", "dragging", "done")
 """A stroke is being drawn, a light is being dragged, or neither."""

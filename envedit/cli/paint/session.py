@@ -16,6 +16,7 @@ import contextlib
 import ctypes
 import gc
 import math
+import shutil
 import time
 from collections.abc import Callable
 from dataclasses import asdict, replace
@@ -27,7 +28,7 @@ import numpy as np
 
 from envedit import inputs, pipeline, renderers
 from envedit.cli.paint import advice, picking
-from envedit.cli.paint.project import SOLUTION, Project
+from envedit.cli.paint.project import MATCHED, SOLUTION, Project
 from envedit.cli.paint.protocol import Document, Edit, Pick
 from envedit.core import latlong
 from envedit.core.arrays import tensor
@@ -36,6 +37,7 @@ from envedit.core.errors import ConfigError, InputError
 from envedit.core.seeds import Seeds
 from envedit.core.types import Views
 from envedit.export import adjustments, file_resolution
+from envedit.images import images
 from envedit.losses import display_curve
 from envedit.losses.perceptual import installed
 from envedit.report import output_folder, run_folder
@@ -123,11 +125,17 @@ class Session:
             "client": "",
         }
         settings = project.settings
+        if project.photo:
+            self._match(project.photo)
         self._stage("loading the scene")
         self.scene = self._worked_on(inputs.load_scene(settings.scene, project.base))
         self._stage("reading the map")
         self.given = inputs.read_map(settings.input, self.scene, settings.input.width)
         self.notes = self.given.warnings
+        source = Path(settings.input.envmap)
+        self.photograph = None  # in the scene's radiance
+        if source.name == MATCHED:
+            self.photograph = images.read(source.with_name("render_target.exr"))[0]
         self.map = self.given.radiance
         height = len(self.map)
         self.rows = inputs.active_rows(settings.input.rows, height)
@@ -580,6 +588,8 @@ class Session:
         """Show everything anew, to a page that has just come."""
         self.resting, self._shown = False, None
         self.tell.frame("before", "transport", self.before, self.scene.rows)
+        if self.photograph is not None:
+            self.tell.frame("photograph", "transport", self.photograph)
         self._tell_unreachable()
         self._explain(self.explanations, self.explanation)
         self._show("transport")
@@ -673,16 +683,9 @@ class Session:
 
         # ---- The run that goes on from it
         settings = installed.settled(project.configured(self.document, start))
-        with output_folder.alone(folder):
-            read = output_folder.inputs_of(settings, project.base)
-            output_folder.prepare_folder(folder, output_folder.names(folder), read)
-            watch = pipeline.Watch(
-                lambda text: self.tell.say({"type": "saving", "text": text}),
-                lambda done, total, text: self._progress(done, total, text),
-            )
-            result = pipeline.run(settings, folder=folder, base=project.base, watch=watch)
-            self.tell.say({"type": "saving", "text": "writing"})
-            warnings = run_folder.write(settings, folder, result, import_s, project.base)
+        result, warnings = self._carried_out(
+            settings, folder, lambda text: self.tell.say({"type": "saving", "text": text}), import_s
+        )
 
         # ---- What was saved, no less sharp than what is shown, and how it differs
         saved, rows = result.maps["edited"], tuple(view.rows for view in result.views)
@@ -700,6 +703,26 @@ class Session:
         told = {"folder": folder.name, "files": files, "warnings": warnings, "notes": notes}
         self.tell.say({"type": "saved", **told})
         return warnings
+
+    def _carried_out(self, settings, folder, stage, import_s=0.0):
+        """Carry a configuration out as `envedit run` does; returns the result, and warnings of its files."""
+        base = self.project.base
+        with output_folder.alone(folder):
+            read = output_folder.inputs_of(settings, base)
+            output_folder.prepare_folder(folder, output_folder.names(folder), read)
+            watch = pipeline.Watch(stage, self._progress)
+            result = pipeline.run(settings, folder=folder, base=base, watch=watch)
+            stage("writing")
+            return result, run_folder.write(settings, folder, result, import_s, base)
+
+    def _match(self, settings):
+        """Find the light of a photograph; its map is painted on, at the resolution of the input's file."""
+        folder = Path(settings.output.dir)
+        self._carried_out(
+            installed.settled(settings), folder, lambda text: self._stage(f"matching the photograph: {text}")
+        )
+        full = folder / "edited_full.exr"
+        shutil.copyfile(full if full.exists() else folder / "edited.exr", folder / MATCHED)
 
     def _differs(self, shown, saved):
         """Say by how much the rendering of the map that was saved differs from the one that was shown."""

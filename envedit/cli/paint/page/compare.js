@@ -31,15 +31,27 @@ export class Compare {
     this.show();
   }
 
+  // Another painting is open: there is no state A of it, and perhaps no photograph.
   forget() {
     this.kept = null;
-    $("reference").options[1].disabled = $("back-a").disabled = true;
+    this.frames.photograph = [];
+    for (const option of [...$("reference").options].slice(1)) option.disabled = true;
+    $("back-a").disabled = true;
     $("reference").value = "0";
+  }
+
+  // The photograph has come: it is what the rendering is compared with at first.
+  photograph() {
+    const option = $("reference").options[2];
+    if (option.disabled) $("reference").value = "2";
+    option.disabled = false;
+    this.show();
   }
 
   // The picture that is shown before, of the present view.
   show() {
-    const frame = ($("reference").value === "1" ? this.kept.render : this.frames.before)[this.on.view()];
+    const pictures = [this.frames.before, this.kept?.render, this.frames.photograph];
+    const frame = pictures[Number($("reference").value)][this.on.view()];
     if (frame) this.displays.render.compare(frame);
   }
 

@@ -1,6 +1,6 @@
 // The WebSocket: JSON both ways, frames from the server; reconnects by itself.
 
-const KINDS = ["render", "map", "difference", "unreachable", "before", "explanation", "sky", "sky-before"];
+const KINDS = ["render", "map", "difference", "unreachable", "before", "explanation", "sky", "sky-before", "photograph"];
 const SOURCES = ["transport", "mitsuba", "saved"];
 
 export class Connection {

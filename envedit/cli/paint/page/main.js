@@ -29,7 +29,7 @@ const PICKS = {
   rim: ["rim", "lights the rim from this place on"], cast: ["cast", "casts a shadow here"],
 };
 const AMOUNTS = { light: [2, 0.6], shadow: [1, 0.6], contrast: [4, 1.6] }; // largest, and what is chosen
-const frames = { render: [], map: [], difference: [], unreachable: [], before: [], explanation: [] }; // the last of each view
+const frames = { render: [], map: [], difference: [], unreachable: [], before: [], photograph: [], explanation: [] }; // the last of each view
 
 let view = 0, views = [], outlined = false;
 let thumbDue = false; // the picture of the present step is taken when it is drawn next
@@ -87,6 +87,7 @@ const connection = new Connection({
 
 function show(frame) {
   if (frame.kind === "before") { compare.show(); return; }
+  if (frame.kind === "photograph") { compare.photograph(); return; }
   if (frame.kind === "render") {
     $("render-stack").parentElement.style.setProperty("--aspect", frame.width / frame.height);
     $("badge").textContent = NAMES[frame.source];

@@ -1,0 +1,82 @@
+"""A ball put into the photograph under a map, beside the ball rendered under the photograph's own light."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+import envedit
+from envedit import config
+from envedit.core import shipped
+from envedit.losses import metrics
+from envedit.targets.photo import Camera
+
+BALL = """<shape type="sphere">
+    <point name="center" x="1.1" y="0.35" z="1.5"/> <float name="radius" value="0.35"/>
+    <bsdf type="roughplastic">
+        <rgb name="diffuse_reflectance" value="0.5, 0.5, 0.5"/> <float name="alpha" value="0.1"/>
+    </bsdf>
+</shape>
+</scene>"""
+HIDDEN = '<integrator type="path"> <boolean name="hide_emitters" value="true"/> </integrator>'
+SPP = 256
+SHOWN = 0.02, 0.98
+"""Display values between which a plate says how a map is exposed."""
+
+
+def composed(
+    plate: np.ndarray, outline: np.ndarray, with_object: np.ndarray, without: np.ndarray
+) -> np.ndarray:
+    """Return the plate with the object: its own pixels, and around it what it changes, as a factor.
+
+    All are radiance (h, w, 3); the outline (h, w, 1) is 1 where the object is.
+    """
+    return outline * with_object + (1 - outline) * plate * with_object / np.maximum(without, 1e-6)
+
+
+class Plate:
+    """A photograph without noise, and the scene with and without the ball.
+
+    Parameters
+    ----------
+    chosen : config.Scene
+        A shipped scene.
+    true : ndarray (H, W, 3)
+        The photograph's map.
+    camera : Camera
+        The photograph's camera.
+    folder : Path
+        For the scenes with the ball.
+    """
+
+    def __init__(self, chosen: config.Scene, true: np.ndarray, camera: Camera, folder: Path):
+        shapes = shipped.folder()
+        scene = (shapes / f"{Path(chosen.file).stem}.xml").read_text()
+        scene = scene.replace('value="statue.ply"', f'value="{shapes / "statue.ply"}"')
+        stage = scene.split('<shape type="rectangle"')[0]
+        texts = {"with": scene.replace("</scene>", BALL), "alone": stage + HIDDEN + BALL, "without": scene}
+        self.scenes = {}
+        for name, text in texts.items():
+            file = folder / f"{name}.xml"
+            file.write_text(text)
+            self.scenes[name] = envedit.load_scene(file, width=chosen.width)
+        self.outline = self.scenes["alone"].alpha[..., None]
+        self.values, self.true = (camera.shown(self._render(name, true)) for name in ("without", "with"))
+
+    def _render(self, name, envmap):
+        return self.scenes[name].render(envmap, SPP).astype(np.float64)
+
+    def inserted(self, envmap: np.ndarray, curve: str) -> dict:
+        """Put the ball in under a map, exposed for each channel as the plate is in the median.
+
+        Returns RMSE and SSIM of the display values, against the ball under the photograph's map.
+        """
+        without, with_ball = (self._render(name, envmap) for name in ("without", "with"))
+        plate = Camera(curve).radiance(np.minimum(self.values, SHOWN[1]))
+        told = (self.values > SHOWN[0]) & (self.values < SHOWN[1]) & (without > 0) & (plate > 0)
+        ratio = np.where(told, plate, np.nan) / np.where(told, without, 1)
+        camera = Camera(curve, np.log(np.nanmedian(ratio, axis=(0, 1))))
+        shown = camera.shown(composed(camera.radiance(self.values), self.outline, with_ball, without))
+        error = float(np.sqrt(np.mean((shown - self.true) ** 2)))
+        return {"insertion RMSE": error, "insertion SSIM": metrics.ssim(shown, self.true)}

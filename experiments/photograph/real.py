@@ -1,0 +1,176 @@
+"""Two real photographs, a rough scene of each, and a ball put into one: ``-m experiments.photograph.real``.
+
+The photographs are of scikit-image's wheel, which pip fetches: ``coffee.png`` (Rachel Michetti, CC0) and
+``astronaut.png`` (NASA, public domain). They and all results go to a folder.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+
+import envedit
+from envedit.core.color import tonemap
+from envedit.core.resampling import fit
+from envedit.images import images
+from envedit.results import Result
+from experiments import puresky
+from experiments.photograph import insertion
+
+WHEEL = "scikit-image==0.26.0"
+SCENES = Path(__file__).parent / "scenes"
+STUDIO = "hdri/studio_small_03_1k.hdr"
+SIZES = {"coffee": (150, 100), "astronaut": (96, 96)}
+"""Width and height of the renderings."""
+LEFT_OUT = {"coffee": [], "astronaut": [(0, 512, 0, 75), (0, 270, 350, 480), (270, 512, 360, 512)]}
+"""Rows and columns of what the scene lacks, pixels of the photograph: flag, model, table."""
+VISOR = 452, 393, 100
+"""Row, column and radius of what counts although it is in them, pixels: the black of the helmet."""
+SIDES = 48
+PROFILES = {
+    "ball": [(np.cos(v), np.sin(v)) for v in np.linspace(-1.57, 1.57, 24)],
+    "saucer": [(0.4, 0), (0.66, 0.03), (0.93, 0.12), (0.955, 0.135), (0.93, 0.14), (0.66, 0.075), (0, 0.05)],
+    "cup_outside": [(0.25, 0.06), (0.32, 0.1), (0.39, 0.28), (0.44, 0.5), (0.47, 0.8)],
+    "cup_inside": [
+        (0.47, 0.8),
+        (0.495, 0.83),
+        (0.49, 0.86),
+        (0.465, 0.87),
+        (0.44, 0.86),
+        (0.42, 0.8),
+        (0.36, 0.42),
+    ],
+}
+"""Radius and height of points on surfaces of revolution, so that their front is on the right upwards."""
+INSERTED = """<shape type="sphere">
+    <point name="center" x="1.1" y="0.2" z="-0.55"/> <float name="radius" value="0.2"/>
+    <bsdf type="roughplastic">
+        <rgb name="diffuse_reflectance" value="0.05, 0.25, 0.3"/> <float name="alpha" value="0.05"/>
+    </bsdf>
+</shape>
+</scene>"""
+PANEL = 225
+"""Height of the rows of the contact sheet, pixels."""
+
+
+def main() -> None:
+    """Fetch the photographs, edit a studio's light towards each, insert the ball, draw ``sheet.jpg``."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("folder", type=Path, help="for photographs, scenes and results")
+    parser.add_argument("--only", choices=SIZES, help="edit this one; the other's results are in the folder")
+    given = parser.parse_args()
+    given.folder.mkdir(parents=True, exist_ok=True)
+    prepare(given.folder)
+    for name in [given.only] if given.only else SIZES:
+        result = edited(name, given.folder)
+        if name == "coffee":
+            insert_ball(result, given.folder)
+    draw(given.folder)
+
+
+def draw(folder: Path) -> None:
+    """Write ``sheet.jpg``, of files: photograph, rendering, outliers, the map before and after, the ball."""
+    studio = images.read(puresky.data(STUDIO) / STUDIO)[0]
+    rows = []
+    for name in SIZES:
+        pictures = [images.read_stored(folder / name / "photograph.png")[0] / 255]
+        pictures += [
+            tonemap(one / 4, "gamma") for one in (studio, images.read(folder / name / "edited.exr")[0])
+        ]
+        pictures += [images.read_stored(folder / "inserted.png")[0] / 255] if name == "coffee" else []
+        rows.append(np.concatenate([scaled(one) for one in pictures], axis=1))
+    width = max(row.shape[1] for row in rows)
+    sheet = np.concatenate([np.pad(row, ((0, 3), (0, width - row.shape[1]), (0, 0))) for row in rows])
+    pixels = np.rint(255 * np.clip(sheet, 0, 1)).astype(np.uint8)
+    mi.Bitmap(pixels).write(str(folder / "sheet.jpg"), quality=85)
+
+
+def prepare(folder: Path) -> None:
+    """Write photographs, masks, scenes and meshes."""
+    command = ["pip", "download", "-q", "--no-deps", "--only-binary", ":all:", "-d", str(folder), WHEEL]
+    subprocess.run([sys.executable, "-m", *command], check=True)
+    with zipfile.ZipFile(next(folder.glob("scikit_image-*.whl"))) as wheel:
+        for name in SIZES:
+            (folder / f"{name}.png").write_bytes(wheel.read(f"skimage/data/{name}.png"))
+            shutil.copy(SCENES / f"{name}.xml", folder)
+            mask = np.ones_like(images.read_stored(folder / f"{name}.png")[0][..., :3])
+            for top, bottom, left, right in LEFT_OUT[name]:
+                mask[top:bottom, left:right] = 0
+            if name == "astronaut":
+                row, column = np.mgrid[: len(mask), : len(mask)]
+                mask[np.hypot(row - VISOR[0], column - VISOR[1]) < VISOR[2]] = 1
+            images.write_png(folder / f"{name}_mask.png", mask)
+    angles = 2 * np.pi * np.arange(SIDES) / SIDES
+    for name, profile in PROFILES.items():
+        lines = [
+            f"v {r * np.cos(a):.4f} {height:.4f} {-r * np.sin(a):.4f}"
+            for r, height in profile
+            for a in angles
+        ]
+        for ring in range(0, (len(profile) - 1) * SIDES, SIDES):
+            for k in range(SIDES):
+                this, following = ring + k + 1, ring + (k + 1) % SIDES + 1
+                lines.append(f"f {this} {following} {following + SIDES} {this + SIDES}")
+        (folder / f"{name}.obj").write_text("\n".join(lines) + "\n")
+
+
+def edited(name: str, folder: Path) -> Result:
+    """Edit a studio's light towards a photograph, and save the result."""
+    width, height = SIZES[name]
+    settings = {
+        "input": {"envmap": str(puresky.data(STUDIO) / STUDIO), "width": 128, "horizon": "free"},
+        "scene": {"file": str(folder / f"{name}.xml"), "width": width, "height": height},
+        "target": {
+            "kind": "photo",
+            "file": str(folder / f"{name}.png"),
+            "mask": str(folder / f"{name}_mask.png"),
+        },
+    }
+    result = envedit.edit(settings)
+    result.save(folder / name)
+    print(f"{name}: {result.photo.summary}, {result.metrics['timing']['total_s']:.0f} s")
+    return result
+
+
+def insert_ball(result: Result, folder: Path) -> None:
+    """Write ``inserted.png``: the coffee with the ball, twice as large as the rendering."""
+    width, height = 2 * SIZES["coffee"][0], 2 * SIZES["coffee"][1]
+    scene = (folder / "coffee.xml").read_text()
+    stage = scene.split('<bsdf type="roughplastic" id="wood">')[0]
+    texts = {
+        "without": scene,
+        "with": scene.replace("</scene>", INSERTED),
+        "alone": stage + insertion.HIDDEN + INSERTED,
+    }
+    scenes = {}
+    for name, text in texts.items():
+        (folder / f"{name}.xml").write_text(text)
+        scenes[name] = envedit.load_scene(folder / f"{name}.xml", width=width, height=height)
+    photo = result.photo.laid((height, width))
+    without, with_object = (
+        scenes[name].render(result.maps["edited"], insertion.SPP) for name in ("without", "with")
+    )
+    outline = scenes["alone"].alpha[..., None]
+    shown = photo.camera.shown(insertion.composed(photo.picture, outline, with_object, without))
+    images.write_png(folder / "inserted.png", shown)
+
+
+def scaled(picture: np.ndarray) -> np.ndarray:
+    """Return a picture of :data:`PANEL` rows."""
+    height, width = picture.shape[:2]
+    if height < PANEL:
+        factor = -(-PANEL // height)
+        picture = picture.repeat(factor, axis=0).repeat(factor, axis=1)
+    return fit(picture, PANEL, round(width * PANEL / height))
+
+
+if __name__ == "__main__":
+    mi.set_variant("llvm_ad_rgb")
+    main()

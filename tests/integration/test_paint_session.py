@@ -7,6 +7,7 @@ import pytest
 
 from envedit import config
 from envedit.cli.paint import project
+from envedit.cli.paint import session as sessions
 from envedit.cli.paint.protocol import Edit, Pick, document
 from envedit.cli.paint.session import Session, Tell
 from envedit.core.rotations import rotation_vector
@@ -38,6 +39,12 @@ def painting(tmp_path_factory):
     file.write_text(SMALL)
     heard = Heard()
     return Session(project.opened(str(file)), heard), heard
+
+
+@pytest.fixture(autouse=True)
+def few_samples(monkeypatch):
+    """Of the rendering that is shown at the end."""
+    monkeypatch.setattr(sessions, "PASSES", sessions.FIRST_PASSES + 1)
 
 
 def solved(painting, phase="done", **changed):

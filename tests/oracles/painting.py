@@ -7,6 +7,7 @@ import threading
 import time
 import urllib.error
 import urllib.request
+from unittest import mock
 
 SMALL = """
 seed = 3
@@ -66,10 +67,10 @@ OF_TWO = SMALL.replace('file = "sphere"\nwidth = 48', 'file = "scene.xml"\nwidth
 
 @contextlib.contextmanager
 def served(name, **more):
-    """Serve a configuration until the block ends; yields the server."""
+    """Serve a configuration until the block ends, with few samples of what is shown; yields the server."""
     import uvicorn
 
-    from envedit.cli.paint import project, settings
+    from envedit.cli.paint import project, session, settings
     from envedit.cli.paint.server import Server
 
     server = Server(None if name is None else project.opened(str(name)), **more)
@@ -78,7 +79,8 @@ def served(name, **more):
     thread.start()
     until(lambda: running.started)
     try:
-        yield server
+        with mock.patch.object(session, "PASSES", session.FIRST_PASSES + 1):
+            yield server
     finally:
         running.should_exit = True
         thread.join(60)

@@ -22,11 +22,12 @@ def read(name: str, head: bytes, info: Info, stored: bool) -> np.ndarray:
     except ImportError:
         raise MachineError(f"{name}: TIFF needs tifffile, which is not installed: {HOW}") from None
     with tifffile.TiffFile(name) as file:
-        page = file.pages[0]
+        page = file.pages.first
         check_declared(name, page.imagewidth, page.imagelength)
-        colours = {"RGB": 3, "MINISBLACK": 1}.get(page.photometric.name)
+        kind = tifffile.PHOTOMETRIC(page.photometric).name
+        colours = {"RGB": 3, "MINISBLACK": 1}.get(kind)
         if colours is None or page.dtype not in (np.uint8, np.uint16, np.float16, np.float32):
-            what = f"{page.photometric.name} of {page.dtype}"
+            what = f"{kind} of {page.dtype}"
             raise InputError(f"{name}: holds {what}, expected grey or RGB of 8 or 16 bits, or floats; {HOW}")
         try:
             pixels = page.asarray()

@@ -5,6 +5,7 @@ the map that it begins with. Other guesses: that of the mean of all other skies,
 deviations of skies and cameras.
 """
 
+import argparse
 import itertools
 
 import numpy as np
@@ -39,6 +40,7 @@ def angle(one: np.ndarray, other: np.ndarray) -> float:
 
 def main() -> None:
     """Print the mean angles over all maps, and of the last guess over all cameras too."""
+    argparse.ArgumentParser(description=__doc__.splitlines()[0]).parse_args()
     maps = [images.load_envmap(str(file), WIDTH, False)[0] for _, file in sorted(puresky.find().items())]
     light = np.array([mean_log_irradiance(envmap) for envmap in maps])
     begun = np.roll(light, FARTHER, axis=0)  # with the map that the experiment edits

@@ -29,6 +29,8 @@ SCENES = Path(__file__).parent / "scenes"
 STUDIO = "hdri/studio_small_03_1k.hdr"
 SIZES = {"coffee": (150, 100), "astronaut": (96, 96)}
 """Width and height of the renderings."""
+HORIZON = {"coffee": "auto", "astronaut": "free"}
+"""A table hides the light from below; without one, lights at any height move whole."""
 LEFT_OUT = {"coffee": [], "astronaut": [(0, 512, 0, 75), (0, 270, 350, 480), (270, 512, 360, 512)]}
 """Rows and columns of what the scene lacks, pixels of the photograph: flag, model, table."""
 VISOR = 452, 393, 100
@@ -125,7 +127,7 @@ def edited(name: str, folder: Path) -> Result:
     """Edit a studio's light towards a photograph, and save the result."""
     width, height = SIZES[name]
     settings = {
-        "input": {"envmap": str(puresky.data(STUDIO) / STUDIO), "width": 128, "horizon": "free"},
+        "input": {"envmap": str(puresky.data(STUDIO) / STUDIO), "width": 128, "horizon": HORIZON[name]},
         "scene": {"file": str(folder / f"{name}.xml"), "width": width, "height": height},
         "target": {
             "kind": "photo",

@@ -183,6 +183,9 @@ class Target(Table):
         "kelvin",
         _PHOTO,
     )
+    vignetting: float = key(
+        0.0, Number(0, 8), "how much darker the photograph's lens makes its corners", "stops", _PHOTO
+    )
     align: bool = key(
         True, Boolean(), "find by how little the photograph is shifted, scaled and rotated", when=_PHOTO
     )

@@ -1,8 +1,9 @@
 """A photograph of the scene as target: its values, and the camera between a rendering and them.
 
 With x the radiance of a rendering and c the log factor of a channel, exposure and white balance together, a
-camera shows curve(exp(c) x), where the curve is one of ``tone_curves.py``. Of one picture exposure and the
-brightness of the map are not separable: both are drawn to what they are without the picture.
+camera shows curve(exp(c) v x), where the curve is one of ``tone_curves.py`` and v what its lens lets through
+of the centre's light, 1 unless it is given. Of one picture exposure and the brightness of the map are not
+separable: both are drawn to what they are without the picture.
 """
 
 from __future__ import annotations
@@ -89,9 +90,9 @@ class Photo:
 
     Attributes
     ----------
-    file : ndarray (H, W, 7)
+    file : ndarray (H, W, 8)
         Of the file, at most :data:`SUPERSAMPLED` times as wide as the film: linear radiance, which of its
-        values are clipped, and how much a pixel counts.
+        values are clipped, what the lens lets through, and how much a pixel counts.
     camera : Camera
         As far as it is known.
     curves : tuple of str
@@ -102,6 +103,8 @@ class Photo:
         On the film: display values in [0, 1], or linear radiance.
     clipped : ndarray of bool (h, w, 3)
         Values that say "at least so bright".
+    let_through : ndarray (h, w, 1)
+        v, the share of the light that the lens lets through beside that of the centre.
     counts : ndarray (h, w, 1) float32
         How much each pixel counts.
     stops, kelvin : float or None
@@ -118,6 +121,7 @@ class Photo:
     placed: alignment.Placement = alignment.Placement()
     values: np.ndarray = field(default_factory=_nothing)
     clipped: np.ndarray = field(default_factory=_nothing)
+    let_through: np.ndarray = field(default_factory=_nothing)
     counts: np.ndarray = field(default_factory=_nothing)
     stops: float | None = None
     kelvin: float | None = None
@@ -133,10 +137,11 @@ class Photo:
         stack, inside = placed.sampled(self.file, factor * height, factor * width)
         stack[..., -1] *= inside
         stack = fit(stack, height, width).astype(np.float64)
-        linear, clipped, counts = np.split(stack, (3, 6), axis=2)
+        linear, clipped, let_through, counts = np.split(stack, (3, 6, 7), axis=2)
         values = linear if self.camera.curve == "linear" else linear_to_srgb(linear)
         counts = counts.astype(np.float32)
-        return replace(self, placed=placed, values=values, clipped=clipped > 0, counts=counts)
+        laid = replace(self, placed=placed, values=values, clipped=clipped > 0, counts=counts)
+        return replace(laid, let_through=let_through)
 
     def aligned(self, rendering: np.ndarray) -> Photo:
         """Return it where its outlines are those of a rendering (h, w, 3), if they are and it may move."""
@@ -166,7 +171,7 @@ class Photo:
     @property
     def picture(self) -> np.ndarray:
         """The photograph as radiance of the scene, (h, w, 3) float32."""
-        return self.camera.radiance(self.values).astype(np.float32)
+        return (self.camera.radiance(self.values) / self.let_through).astype(np.float32)
 
     def under(self, curve: str, rendering: np.ndarray, weight: np.ndarray | None) -> Photo:
         """Return it with another curve, and the factor at which a rendering is nearest in the median."""
@@ -174,7 +179,7 @@ class Photo:
         return replace(self, camera=replace(camera, log_factor=self._factor(camera, rendering, weight)))
 
     def _factor(self, camera, rendering, weight):
-        exposed = camera.radiance(self.values)
+        exposed = camera.radiance(self.values) / self.let_through
         telling = ~self.clipped & (self.values > DARKEST) & (rendering > 0) & (exposed > 0)
         if weight is not None:
             telling &= weight > 0
@@ -210,11 +215,11 @@ class Photo:
 
     def missed(self, rendering: np.ndarray) -> np.ndarray:
         """Return what the camera shows of a rendering (h, w, 3) less the photograph's values."""
-        return self.camera.shown(rendering) - self.values
+        return self.camera.shown(rendering * self.let_through) - self.values
 
     def displayed(self, radiance: np.ndarray) -> np.ndarray:
         """Return the light of a display, white at 1, on which the camera shows radiance (h, w, 3)."""
-        shown = self.camera.shown(radiance)
+        shown = self.camera.shown(radiance * self.let_through)
         light = shown if self.camera.curve == "linear" else srgb_to_linear(shown)
         return np.asarray(light, np.float32)
 
@@ -245,7 +250,9 @@ def _balance(kelvin):
     return gain / float(luminance(gain))
 
 
-def read(file: FilePath, mask: FilePath, outlines: np.ndarray, align: bool = True) -> tuple[Photo, list[str]]:
+def read(
+    file: FilePath, mask: FilePath, outlines: np.ndarray, align: bool = True, vignetting: float = 0.0
+) -> tuple[Photo, list[str]]:
     """Read a photograph and lay it on the film of a rendering.
 
     Parameters
@@ -257,6 +264,9 @@ def read(file: FilePath, mask: FilePath, outlines: np.ndarray, align: bool = Tru
         The scene under light from everywhere, linear radiance.
     align : bool
         Find how it is shifted, scaled and rotated; otherwise it lies as it is.
+    vignetting : float
+        Stops by which its corners are darker than a lens without vignetting would make them: with r the
+        distance from the centre over that of the corners, v = 2^(-vignetting r^2).
 
     Returns
     -------
@@ -286,7 +296,10 @@ def read(file: FilePath, mask: FilePath, outlines: np.ndarray, align: bool = Tru
         )
 
     # ---- At most as many pixels as are needed, averaged as light
-    stack = np.concatenate([values if info["hdr"] else srgb_to_linear(values), clipped, counts], axis=2)
+    linear = values if info["hdr"] else srgb_to_linear(values)
+    y, x = np.linspace(-1, 1, rows)[:, None], np.linspace(-1, 1, columns)
+    of_corners = ((y * rows) ** 2 + (x * columns) ** 2) / (rows**2 + columns**2)
+    stack = np.concatenate([linear, clipped, 2.0 ** (-vignetting * of_corners[..., None]), counts], axis=2)
     film = SUPERSAMPLED * height, SUPERSAMPLED * width
     stack = fit(stack, min(rows, film[0]), min(columns, film[1])).astype(np.float64)
     curves = ("linear",) if info["hdr"] else tuple(TONE_CURVES)

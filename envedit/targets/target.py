@@ -262,7 +262,8 @@ def _of_photo(settings, scene, envmap, picture, mask):
     spp, cache = chosen.spp, settings.renderer.cache
     outlines, _, _ = rendered(scene, everywhere, spp, Seeds.of(settings.seed).target_again, cache)
     file = chosen.files[0]
-    found, warnings = photographs.read(file, "".join(chosen.masks), outlines, chosen.align)
+    mask_file = "".join(chosen.masks)
+    found, warnings = photographs.read(file, mask_file, outlines, chosen.align, chosen.vignetting)
 
     # ---- Its camera
     initial, spp, _ = with_noise(settings, scene, envmap)

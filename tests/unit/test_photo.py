@@ -51,6 +51,20 @@ def test_exposure_and_white_balance_are_found_under_the_right_curve(lit, tmp_pat
     np.testing.assert_allclose(displayed[seen], srgb_to_linear(found.photo.values)[seen], rtol=1e-3)
 
 
+def test_a_lens_that_darkens_corners_is_undone(lit, tmp_path):
+    height, width = lit[2].shape[:2]
+    y, x = np.linspace(-height, height, height)[:, None], np.linspace(-width, width, width)
+    through = 2.0 ** (-2.0 * (x**2 + y**2) / (height**2 + width**2))[..., None]
+    images.write_exr(tmp_path / "photo.exr", (lit[2] * through).astype(np.float32))
+    fitting = made(lit, tmp_path / "photo.exr", vignetting=2.0)
+    factor = fitting.picture / np.maximum(lit[2], 1e-6)
+    assert np.ptp(factor[lit[2] > 0]) < 1e-3 * np.median(factor)
+    shown = fitting.photo.displayed(fitting.picture)
+    np.testing.assert_allclose(shown, fitting.photo.values, rtol=1e-4, atol=1e-6)
+    plain = made(lit, tmp_path / "photo.exr").picture
+    assert plain[0, 0].mean() < 0.5 * fitting.picture[0, 0].mean()
+
+
 def test_what_is_given_of_the_camera_stays(lit, tmp_path):
     file = taken(lit, tmp_path / "photo.png", Camera("srgb", FACTOR))
     found = made(lit, file, exposure=1.0, white_balance=4000.0).photo.camera

@@ -23,24 +23,12 @@ _MOST_SAMPLES = 2**21  # at a time
 
 @dataclass(frozen=True, eq=False)
 class OwnLight:
-    """An environment emitter of a parsed scene.
+    """An environment emitter of a parsed scene."""
 
-    Attributes
-    ----------
-    plugin : str
-        Its kind, such as ``sunsky``.
-    texels : ndarray (H, W, 3) or None
-        What an ``envmap`` was given in place of a file.
-    state : mitsuba.parser.ParserState
-        A scene of this emitter alone, not built.
-    where : str
-        What errors call the scene.
-    """
-
-    plugin: str
-    texels: np.ndarray | None
-    state: mi.parser.ParserState
-    where: str
+    plugin: str  # its kind, such as ``sunsky``
+    texels: np.ndarray | None  # (H, W, 3), what an ``envmap`` was given in place of a file
+    state: mi.parser.ParserState  # a scene of this emitter alone, not built
+    where: str  # what errors call the scene
 
     @classmethod
     def of(cls, state: mi.parser.ParserState, index: int, where: str) -> OwnLight:

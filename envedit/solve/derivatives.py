@@ -27,24 +27,13 @@ SIZE_STEP = 0.1
 
 @dataclass(frozen=True)
 class Linearisation:
-    """Derivatives of a rendering.
+    """Derivatives of a rendering."""
 
-    Attributes
-    ----------
-    pictures : ndarray (k, h, w, 3)
-        By the unknowns of lights, by a camera's factors, and by the saturation.
-    named : list of (str, int, int or ndarray)
-        Which these are: name, light, and channel or axis.
-    profile : ndarray (h, w, 3)
-        Of the sky's light within blocks.
-    jacobian : list of ndarray (blocks, nodes)
-        By the log gain, per channel.
-    """
-
+    # (k, h, w, 3), by the unknowns of lights, by a camera's factors, and by the saturation
     pictures: np.ndarray
-    named: list
-    profile: np.ndarray
-    jacobian: list[np.ndarray]
+    named: list  # (str, int, int or ndarray), which these are: name, light, and channel or axis
+    profile: np.ndarray  # (h, w, 3), of the sky's light within blocks
+    jacobian: list[np.ndarray]  # (blocks, nodes), by the log gain, per channel
 
 
 class Derivatives:

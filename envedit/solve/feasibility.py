@@ -54,32 +54,19 @@ FULL_COLOUR_DIFFERENCE = 0.25
 
 @dataclass(frozen=True)
 class Reach:
-    """What is within reach.
+    """What is within reach."""
 
-    Attributes
-    ----------
-    share : float
-        1 - mean |closest - target| / mean |initial - target| over the painted pixels, by coverage, on
-        display values clip(x, 0, 1)^(1/2.2); from 0 to 1, and 1 if nothing is asked.
-    picture : ndarray (h, w, 3) float32
-        The closest picture, linear radiance.
-    residual : ndarray (h, w, 3) float32
-        Display values of the target less those of the closest picture: positive where no light is bright
-        enough without brightening what must stay, negative where none is dark enough.
-    envmap : ndarray (H, W, 3) float32
-        A map that renders to the picture; it answers this question only and does not look like a sky.
-    too_dark : float
-        Share of the residual in the painted region that is positive.
-    all_painted : bool
-        No pixel is held.
-    """
-
+    # 1 - mean |closest - target| / mean |initial - target| over the painted pixels, by coverage, on display
+    # values clip(x, 0, 1)^(1/2.2); from 0 to 1, and 1 if nothing is asked
     share: float
-    picture: np.ndarray
+    picture: np.ndarray  # (h, w, 3) float32, the closest picture, linear radiance
+    # (h, w, 3) float32, display values of the target less those of the closest picture: positive where no
+    # light is bright enough without brightening what must stay, negative where none is dark enough
     residual: np.ndarray
+    # (H, W, 3) float32, a map that renders to the picture; it does not look like a sky
     envmap: np.ndarray
-    too_dark: float = 0.0
-    all_painted: bool = False
+    too_dark: float = 0.0  # share of the residual in the painted region that is positive
+    all_painted: bool = False  # no pixel is held
 
     @property
     def note(self) -> str:

@@ -32,40 +32,24 @@ the start's squared error that the solution's must be below."""
 
 @dataclass
 class Run:
-    """State of a solution between two steps: all that is needed to continue.
+    """State of a solution between two steps: all that is needed to continue."""
 
-    Attributes
-    ----------
-    state, start : dict of str to ndarray
-        Unknowns now, and the centre of the prior of lights: ``gain`` (nodes, 3), ``turn``, ``flux``
-        (lights, 3) and ``size`` (lights, 1), logarithms and radians.
-    damping, scale : float
-        Of the next step; the threshold s.
-    finished : bool
-        No further step is made.
-    history : list of dict
-        A row a step: ``loss`` F, its parts ``data`` and ``prior``, the ``sigma`` at which they were
-        taken, ``residual`` RMS of display values, ``damping``, ``step_ms``.
-    most : int
-        Steps after which it ends.
-    hold : float
-        Weight of what was not painted, where it is raised (:mod:`.hold`).
-    corrected : bool
-        The last steps, towards a target without T's error (:mod:`.transport_error`).
-    wide : bool
-        Derivatives by a light's direction are wide differences: with narrow ones no step leads further.
-    """
-
+    # state, start: unknowns now, and the centre of the prior of lights: ``gain`` (nodes, 3), ``turn``,
+    # ``flux`` (lights, 3) and ``size`` (lights, 1), logarithms and radians
     state: dict
     start: dict
+    # damping, scale: of the next step; the threshold s
     damping: float = 1e-3
     scale: float = np.inf
-    finished: bool = False
+    finished: bool = False  # no further step is made
+    # A row a step: ``loss`` F, its parts ``data`` and ``prior``, the ``sigma`` at which they were taken,
+    # ``residual`` RMS of display values, ``damping``, ``step_ms``
     history: list[dict] = field(default_factory=list)
-    most: int = MOST_STEPS
-    hold: float = 1.0
+    most: int = MOST_STEPS  # steps after which it ends
+    hold: float = 1.0  # weight of what was not painted, where it is raised (:mod:`.hold`)
+    # Derivatives by a light's direction are wide differences: with narrow ones no step leads further
     wide: bool = False
-    corrected: bool = False
+    corrected: bool = False  # the last steps, towards a target without T's error (:mod:`.transport_error`)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return all but the history as arrays, for a checkpoint."""
@@ -88,28 +72,15 @@ class Run:
 
 @dataclass
 class Solution:
-    """What :func:`solve` found.
+    """What :func:`solve` found."""
 
-    Attributes
-    ----------
-    params : dict
-        Of the layers.
-    history : list of dict
-        A row a step: ``loss`` F, its parts ``data`` and ``prior``, the ``sigma`` at which they were
-        taken, ``residual`` RMS of display values, ``damping``, ``step_ms``.
-    run : Run
-        As it ended.
-    posterior : Posterior
-        How well the picture determines the sky.
-    note : str
-        What a user should know.
-    """
-
-    params: dict
+    params: dict  # of the layers
+    # A row a step: ``loss`` F, its parts ``data`` and ``prior``, the ``sigma`` at which they were taken,
+    # ``residual`` RMS of display values, ``damping``, ``step_ms``
     history: list[dict]
-    run: Run
-    posterior: Posterior
-    note: str = ""
+    run: Run  # as it ended
+    posterior: Posterior  # how well the picture determines the sky
+    note: str = ""  # what a user should know
 
 
 def solve(

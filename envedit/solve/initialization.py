@@ -32,27 +32,14 @@ grids made maps worse (matpreview, principled: by 1 to 4 dB), with colours that 
 
 @dataclass(frozen=True)
 class Recordings:
-    """What lights are looked for through.
+    """What lights are looked for through."""
 
-    Attributes
-    ----------
-    transport : LightTransport
-        T; the one that the run renders through, where it does.
-    second : LightTransport or None
-        Another recording of T, where detail is asked about.
-    octaves : list of Octave
-        Detail that the picture determines; see :func:`.gain_bandwidth.octaves`.
-    notes : list of str
-        What was found and chosen.
-    views : tuple of slice
-        Rows of each view.
-    """
-
-    transport: LightTransport
-    second: LightTransport | None = None
+    transport: LightTransport  # T; the one that the run renders through, where it does
+    second: LightTransport | None = None  # another recording of T, where detail is asked about
+    # Detail that the picture determines; see :func:`.gain_bandwidth.octaves`
     octaves: list[Octave] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)
-    views: tuple[slice, ...] = ()
+    notes: list[str] = field(default_factory=list)  # what was found and chosen
+    views: tuple[slice, ...] = ()  # rows of each view
 
 
 def recordings(

@@ -43,23 +43,13 @@ VISIBLE = 0.02
 
 @dataclass(frozen=True)
 class Likelihood:
-    """The likelihood of residuals.
+    """The likelihood of residuals."""
 
-    Attributes
-    ----------
-    weight : ndarray (h, w, 1)
-        How much each pixel counts beside the others; 1 on average (:func:`on_average_one`).
-    independent : float
-        Independent values of a channel among the pixels.
-    paint_noise : float or None
-        Largest standard error of paint, of display values; None: a rendering.
-    rest : ndarray (h, w, 1) or None
-        How much each pixel is of the rest, in [0, 1], whose mean is to stay; None: there is none.
-    """
-
+    # (h, w, 1), how much each pixel counts beside the others; 1 on average (:func:`on_average_one`)
     weight: np.ndarray
-    independent: float = INDEPENDENT
-    paint_noise: float | None = None
+    independent: float = INDEPENDENT  # independent values of a channel among the pixels
+    paint_noise: float | None = None  # largest standard error of paint, of display values; None: a rendering
+    # (h, w, 1), how much each pixel is of the rest, in [0, 1], whose mean is to stay; None: there is none
     rest: np.ndarray | None = None
 
     @classmethod

@@ -51,24 +51,14 @@ added to a map without any."""
 
 @dataclass(frozen=True)
 class Explanation:
-    """A solution after a few steps.
+    """A solution after a few steps."""
 
-    Attributes
-    ----------
-    done : dict of int to str
-        What was done to lights, by their numbers.
-    run, point : Run, Point
-        Where the solution goes on.
-    score : float
-        -2 log evidence, but for a constant.
-    others : tuple of Explanation
-        Of the likeliest that :func:`search` finds: the next ones, each of another :attr:`name`.
-    """
-
-    done: dict[int, str]
+    done: dict[int, str]  # what was done to lights, by their numbers
+    # run, point: where the solution goes on
     run: gauss_newton.Run
     point: Point
-    score: float
+    score: float  # -2 log evidence, but for a constant
+    # Of the likeliest that :func:`search` finds: the next ones, each of another :attr:`name`
     others: tuple[Explanation, ...] = ()
 
     @property

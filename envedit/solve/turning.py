@@ -33,21 +33,13 @@ keep their bits then."""
 
 @dataclass(frozen=True)
 class Turn:
-    """A turn of the sky.
+    """A turn of the sky."""
 
-    Attributes
-    ----------
-    degrees : float
-        As for :func:`.latlong.rotate`.
-    error, still : float
-        Display residual, as of :func:`apart`, with the turn alone and without.
-    blocks : float
-        The share of the residual of blocks that the turn leaves, beyond what the block transport errs by.
-    """
-
-    degrees: float
+    degrees: float  # as for :func:`.latlong.rotate`
+    # error, still: display residual, as of :func:`apart`, with the turn alone and without
     error: float
     still: float
+    # The share of the residual of blocks that the turn leaves, beyond what the block transport errs by
     blocks: float = np.inf
 
     @property

@@ -29,24 +29,13 @@ NOTHING: Mapping[str, object] = MappingProxyType({})
 
 @dataclass(frozen=True)
 class Painted:
-    """A painted picture.
+    """A painted picture."""
 
-    Attributes
-    ----------
-    picture : ndarray (h, w, 3) float32
-        Linear radiance; where nothing was painted the initial rendering's own, if that is known.
-    coverage : ndarray (h, w, 1) float32
-        How much each pixel was painted, in [0, 1].
-    excluded : ndarray of bool (h, w)
-        Pixels without information: clipped, or transparent over nothing.
-    warnings : tuple of str
-        What the user should know.
-    """
-
+    # (h, w, 3) float32, linear radiance; where nothing was painted that of the initial rendering, if known
     picture: np.ndarray
-    coverage: np.ndarray
-    excluded: np.ndarray
-    warnings: tuple[str, ...]
+    coverage: np.ndarray  # (h, w, 1) float32, how much each pixel was painted, in [0, 1]
+    excluded: np.ndarray  # bool (h, w), pixels without information: clipped, or transparent over nothing
+    warnings: tuple[str, ...]  # what the user should know
 
 
 # ----------------------------------------------------------------------------------------------------------
@@ -290,9 +279,7 @@ def _tonemap_of(file, info, said, declared, exported, warnings):
     return name
 
 
-def planes(
-    file: FilePath, pixels: np.ndarray, warnings: list[str]
-) -> tuple[np.ndarray, np.ndarray, int]:
+def planes(file: FilePath, pixels: np.ndarray, warnings: list[str]) -> tuple[np.ndarray, np.ndarray, int]:
     """Return values (h, w, 3) and alpha (h, w), float64, and the largest code; codes become [0, 1]."""
     top = 1 if pixels.dtype == np.float32 else int(np.iinfo(pixels.dtype).max)
     values = pixels.astype(np.float64) / top

@@ -51,22 +51,14 @@ _MOST = float(np.finfo(np.float32).max)
 
 @dataclass(frozen=True)
 class Painted:
-    """A picture after its strokes.
+    """A picture after its strokes."""
 
-    Attributes
-    ----------
-    picture : ndarray (h, w, 3) float32
-        Linear radiance. Where coverage is 0 it is the picture given, bit for bit.
-    coverage : ndarray (h, w, 1) float32
-        In [0, 1], how much of a pixel lies under strokes, whatever their opacity (but not if that is 0):
-        1 - prod(1 - c).
-    warnings : tuple of str
-        Strokes that painted nothing, by name.
-    """
-
+    # (h, w, 3) float32, linear radiance. Where coverage is 0 it is the picture given, bit for bit
     picture: np.ndarray
+    # (h, w, 1) float32, in [0, 1], how much of a pixel lies under strokes, whatever their opacity (but not if
+    # that is 0): 1 - prod(1 - c)
     coverage: np.ndarray
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()  # strokes that painted nothing, by name
 
 
 def paint(picture: np.ndarray, strokes: Sequence[dict], tonemap: str = "gamma") -> Painted:

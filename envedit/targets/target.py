@@ -39,49 +39,27 @@ MOST_WHITE = 0.1
 
 @dataclass(frozen=True)
 class Target:
-    """The picture wanted.
+    """The picture wanted."""
 
-    Attributes
-    ----------
-    picture : ndarray (h, w, 3)
-        Linear radiance.
-    weight : ndarray (h, w, 1) or None
-        How much each pixel counts; None: all the same.
-    envmap : ndarray (H, W, 3) or None
-        The map that makes the picture, where it is known.
-    source : str
-        One line for the report.
-    warnings : tuple of str
-        What the user should know about the picture.
-    initial : ndarray (h, w, 3) or None
-        What was painted on: the rendering under the map as it is; None where nothing was painted.
-    coverage : ndarray (h, w, 1) or None
-        How much each pixel was painted; None likewise.
-    asked : tuple of ndarray
-        What the target was made from beside the configuration, for a checkpoint to know it by. Not the
-        rendering that was painted on: rendered anew, it may differ in its last bits.
-    noise : ndarray (h, w) or None
-        Standard error of the picture's display values; None where it is not known.
-    spp : int or None
-        Samples a pixel that the picture was rendered with; None where it was not rendered.
-    compared : ndarray (h, w, 3) or None
-        What the loop compares T E with, linear radiance; None: the picture. Usually the picture as T sees it
-        (:meth:`seen_as`).
-    photo : Photo or None
-        The photograph that the picture is, as far as its camera is known.
-    """
-
-    picture: np.ndarray
-    weight: np.ndarray | None
-    envmap: np.ndarray | None
-    source: str
-    warnings: tuple[str, ...] = ()
+    picture: np.ndarray  # (h, w, 3), linear radiance
+    weight: np.ndarray | None  # (h, w, 1), how much each pixel counts; None: all the same
+    envmap: np.ndarray | None  # (H, W, 3), the map that makes the picture, where it is known
+    source: str  # one line for the report
+    warnings: tuple[str, ...] = ()  # what the user should know about the picture
+    # (h, w, 3), what was painted on: the rendering under the map as it is; None where nothing was painted
     initial: np.ndarray | None = None
-    coverage: np.ndarray | None = None
+    coverage: np.ndarray | None = None  # (h, w, 1), how much each pixel was painted; None likewise
+    # What the target was made from beside the configuration, for a checkpoint to know it by. Not the
+    # rendering that was painted on: rendered anew, it may differ in its last bits
     asked: tuple[np.ndarray, ...] = ()
+    # (h, w), standard error of the picture's display values; None where it is not known
     noise: np.ndarray | None = None
+    # Samples a pixel that the picture was rendered with; None where it was not rendered
     spp: int | None = None
+    # (h, w, 3), what the loop compares T E with, linear radiance; None: the picture. Usually the picture as T
+    # sees it (:meth:`seen_as`)
     compared: np.ndarray | None = None
+    # The photograph that the picture is, as far as its camera is known
     photo: photographs.Photo | None = None
 
     @property

@@ -25,27 +25,14 @@ BLOCKS = 32
 
 @dataclass(frozen=True)
 class Overview:
-    """T between blocks and cells.
+    """T between blocks and cells."""
 
-    Attributes
-    ----------
-    matrix : ndarray (3, blocks, cells) float32
-        Mean over the pixels of a block, for a radiance of 1 in all texels of a cell.
-    block_of : ndarray of int64 (h * w,)
-        Block of every pixel.
-    cell_of : ndarray of int64 (H * W,)
-        Cell of every texel.
-    directions : ndarray (cells, 3)
-        Unit vectors to the cells' centres.
-    omega : ndarray (cells,)
-        Solid angle of each cell, as a rendering receives it.
-    """
-
+    # (3, blocks, cells) float32, mean over the pixels of a block, for a radiance of 1 in all texels of a cell
     matrix: np.ndarray
-    block_of: np.ndarray
-    cell_of: np.ndarray
-    directions: np.ndarray
-    omega: np.ndarray
+    block_of: np.ndarray  # (h * w,), block of every pixel
+    cell_of: np.ndarray  # (H * W,), cell of every texel
+    directions: np.ndarray  # (cells, 3), unit vectors to the cells' centres
+    omega: np.ndarray  # (cells,), solid angle of each cell, as a rendering receives it
 
     def to_blocks(self, picture: np.ndarray) -> np.ndarray:
         """Average a picture (h, w, c) over blocks: (blocks, c)."""

@@ -37,29 +37,18 @@ class SamplingPlan:
     """How T is sampled; made by :func:`choose`.
 
     Other attributes are those of :class:`.LightTransport`.
-
-    Attributes
-    ----------
-    mass : ndarray (H,)
-        Share of the samples by row of the map, up to a factor.
-    lamps : int
-        Path depth of the light of other lamps; 0: there are none; -1: any.
-    paths_bytes : int
-        Memory for camera paths that are kept for further columns.
-    choices : tuple of str
-        What was chosen automatically, with the measurement that decided.
     """
 
     spp: int
     bounces: int
     capacity: int
-    mass: np.ndarray
-    lamps: int
+    mass: np.ndarray  # (H,), share of the samples by row of the map, up to a factor
+    lamps: int  # path depth of the light of other lamps; 0: there are none; -1: any
     depth_error: float
     paths: tuple[int, int, int]
     tolerance: float
-    paths_bytes: int
-    choices: tuple[str, ...]
+    paths_bytes: int  # memory for camera paths that are kept for further columns
+    choices: tuple[str, ...]  # what was chosen automatically, with the measurement that decided
     warnings: tuple[str, ...]
 
     def key(self) -> dict[str, Any]:

@@ -7,16 +7,13 @@ import mitsuba as mi
 import numpy as np
 
 from envedit.scene import camera_paths
+from envedit.scene.camera_paths import NoPlaceError
 from envedit.scene.scene import Scene
 
 NEAR = np.array([(x, y) for y in (-1, 0, 1) for x in (-1, 0, 1)])
 """Pixels around a picked one, in rows, of which one may be in the shadow: its edge is hard to hit."""
 PASSED = 16
 """Most surfaces that a ray goes through without being scattered, such as the holes of a mask."""
-
-
-class NoShadowError(ValueError):
-    """No shadow is found at a place, or can be put there; the text says why."""
 
 
 def occluder(scene: Scene, view: int, x: float, y: float, toward: np.ndarray) -> np.ndarray:
@@ -36,7 +33,7 @@ def occluder(scene: Scene, view: int, x: float, y: float, toward: np.ndarray) ->
 
     Raises
     ------
-    NoShadowError
+    NoPlaceError
         No surface is seen there, it faces away from the light, or nothing is between both.
     """
     rows = scene.rows[view]
@@ -53,10 +50,10 @@ def occluder(scene: Scene, view: int, x: float, y: float, toward: np.ndarray) ->
     if blocked.any():
         return hit.p.numpy().T[int(np.argmax(blocked))].astype(np.float64)
     if not surfaces.is_valid().numpy()[0]:
-        raise NoShadowError("no surface is seen there")
+        raise NoPlaceError("no surface is seen there")
     if not facing.numpy()[0]:
-        raise NoShadowError("the surface faces away from the light there: pick a shadow that is cast")
-    raise NoShadowError("the place is in no shadow of the light")
+        raise NoPlaceError("the surface faces away from the light there: pick a shadow that is cast")
+    raise NoPlaceError("the place is in no shadow of the light")
 
 
 def direction(scene: Scene, view: int, x: float, y: float, point: np.ndarray) -> np.ndarray:
@@ -76,16 +73,16 @@ def direction(scene: Scene, view: int, x: float, y: float, point: np.ndarray) ->
 
     Raises
     ------
-    NoShadowError
+    NoPlaceError
         No surface is seen there, or it faces away from the point.
     """
     surface = surfaces_seen(scene, view, np.array([[x, y]]))
     if not surface.is_valid().numpy()[0]:
-        raise NoShadowError("no surface is seen there")
+        raise NoPlaceError("no surface is seen there")
     toward = np.float64(point) - surface.p.numpy()[:, 0]
     normal, eye = (v.numpy()[:, 0] for v in (surface.n, surface.to_world(surface.wi)))
     if (toward @ normal) * (eye @ normal) <= 0:
-        raise NoShadowError("the surface faces away from what casts the shadow")
+        raise NoPlaceError("the surface faces away from what casts the shadow")
     light = scene.to_world.T @ toward
     return light / np.linalg.norm(light)
 

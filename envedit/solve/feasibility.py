@@ -109,7 +109,6 @@ def reachable(
     target: np.ndarray,
     likelihood: Likelihood | None = None,
     rows: Rows | None = None,
-    free: np.ndarray | None = None,
     painted: np.ndarray | None = None,
     rendered: np.ndarray | None = None,
     known: np.ndarray | None = None,
@@ -128,8 +127,6 @@ def reachable(
         How much each pixel counts, and the mean of what was not painted; by default all count the same.
     rows : Rows, optional
         Active rows; the light of the others stays. All by default.
-    free : ndarray of bool (rows, W), optional
-        Texels of the active rows that may change; all by default.
     painted : ndarray (h, w), optional
         Coverage of the region that the request is about, 0 to 1; where None, all pixels that count.
     rendered : ndarray (h, w, 3), optional
@@ -155,9 +152,8 @@ def reachable(
     """
     # ---- The request
     original = np.ascontiguousarray(original, np.float32)
-    height, width, _ = original.shape
-    active = np.zeros((height, width), bool)
-    active[slice(None) if rows is None else rows.slice] = True if free is None else free
+    active = np.zeros(original.shape[:2], bool)
+    active[slice(None) if rows is None else rows.slice] = True
     request = _Request.of(transport, original, target, likelihood, painted, rendered)
     distance = request.distance(request.initial)
     if distance < 1e-6:  # float32

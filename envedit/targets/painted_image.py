@@ -8,7 +8,6 @@ format.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from types import MappingProxyType
 
 import numpy as np
@@ -20,22 +19,12 @@ from envedit.core.types import FilePath, Shape
 from envedit.images import images
 from envedit.targets import initial_rendering
 from envedit.targets.paint_detection import differs
+from envedit.targets.strokes import Painted
 
 NEARLY_ALL = 0.9
 MOST_RESIZED = 16
 """Times as wide, or as narrow, as the rendering that a picture may be: others are no resized exports."""
 NOTHING: Mapping[str, object] = MappingProxyType({})
-
-
-@dataclass(frozen=True)
-class Painted:
-    """A painted picture."""
-
-    # (h, w, 3) float32, linear radiance; where nothing was painted that of the initial rendering, if known
-    picture: np.ndarray
-    coverage: np.ndarray  # (h, w, 1) float32, how much each pixel was painted, in [0, 1]
-    excluded: np.ndarray  # bool (h, w), pixels without information: clipped, or transparent over nothing
-    warnings: tuple[str, ...]  # what the user should know
 
 
 # ----------------------------------------------------------------------------------------------------------

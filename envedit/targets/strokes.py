@@ -36,6 +36,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -51,14 +52,16 @@ _MOST = float(np.finfo(np.float32).max)
 
 @dataclass(frozen=True)
 class Painted:
-    """A picture after its strokes."""
+    """A painted picture."""
 
-    # (h, w, 3) float32, linear radiance. Where coverage is 0 it is the picture given, bit for bit
+    # (h, w, 3) float32, linear radiance. Where coverage is 0 it is the picture painted on, bit for bit
     picture: np.ndarray
-    # (h, w, 1) float32, in [0, 1], how much of a pixel lies under strokes, whatever their opacity (but not if
-    # that is 0): 1 - prod(1 - c)
+    # (h, w, 1) float32, in [0, 1], how much of a pixel was painted: under strokes, whatever their opacity
+    # (but not if that is 0), 1 - prod(1 - c)
     coverage: np.ndarray
-    warnings: tuple[str, ...] = ()  # strokes that painted nothing, by name
+    # bool (h, w), pixels of a file without information: clipped, or transparent over nothing; None: none
+    excluded: Any = None
+    warnings: tuple[str, ...] = ()  # what the user should know
 
 
 def paint(picture: np.ndarray, strokes: Sequence[dict], tonemap: str = "gamma") -> Painted:
@@ -105,7 +108,8 @@ def paint(picture: np.ndarray, strokes: Sequence[dict], tonemap: str = "gamma") 
         result = np.where(covered > 0, np.minimum(painted, _MOST), result)
         bare *= 1 - covered
     total = (1 - bare).astype(np.float32)
-    return Painted(np.where(total > 0, result.astype(np.float32), image), total, tuple(warnings))
+    picture = np.where(total > 0, result.astype(np.float32), image)
+    return Painted(picture, total, warnings=tuple(warnings))
 
 
 def _checked(picture):

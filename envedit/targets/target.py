@@ -129,70 +129,75 @@ def make(
     ConfigError
         If a view is not the scene's, or is given twice; as of :func:`.extensions.load`.
     """
-    chosen, alpha = settings.target, scene.alpha
-    hidden = None if alpha is None else alpha == 0
-    named = picture is None and other is None and chosen.kind == "envmap" and chosen.file
-    if named and not images.is_panorama(str(chosen.file)):
-        settings = replace(settings, target=replace(chosen, kind="rendering"))
-        made = _of_rendering(settings, scene, envmap, None, None, " (it is not 2:1, as a map is)")
-        return _seen(made, hidden, settings.output.tonemap)
+    hidden = None if scene.alpha is None else scene.alpha == 0
+    made = _made(settings, scene, envmap, picture, mask, other, hidden)
+    return _seen(made, hidden, settings.output.tonemap)
+
+
+def _made(settings, scene, envmap, picture, mask, other, hidden):
+    """Make the target, without regard to pixels that see no surface where nothing was painted."""
+    # ---- The scene under another map
+    chosen = settings.target
     if picture is None and chosen.kind == "envmap":
-        return _seen(_rendered(settings, scene, envmap, other), hidden, settings.output.tonemap)
+        if other is not None or not chosen.file or images.is_panorama(str(chosen.file)):
+            return _rendered(settings, scene, envmap, other)
+        settings = replace(settings, target=replace(chosen, kind="rendering"))
+        return _of_rendering(settings, scene, envmap, None, None, " (it is not 2:1, as a map is)")
+
+    # ---- A picture of the scene under other light
     if chosen.kind == "photo":
-        return _seen(_of_photo(settings, scene, envmap, picture, mask), hidden, settings.output.tonemap)
+        return _of_photo(settings, scene, envmap, picture, mask)
     if chosen.kind not in config.TARGET_KINDS and picture is None:
         picture = extensions.load(extensions.TARGETS, chosen.kind)(settings, scene, envmap)
-        chosen = replace(chosen, kind="rendering")
+        return _of_rendering(settings, scene, envmap, picture, mask)
     if chosen.kind == "rendering":
         if picture is None and not chosen.file:  # an array may take its place
             raise ConfigError(
                 'target.file: got "", expected the picture of the scene, as target.kind is "rendering"'
             )
-        made = _of_rendering(settings, scene, envmap, picture, mask)
-        return _seen(made, hidden, settings.output.tonemap)
-    shape = scene.height, scene.width
+        return _of_rendering(settings, scene, envmap, picture, mask)
+
+    # ---- What was painted
     initial = initial_rendering.initial(scene, envmap, settings)
     asked: tuple[np.ndarray, ...] = ()
     if picture is not None:
-        found = painted_image.given(picture, shape, initial, mask)
+        painted = painted_image.given(picture, (scene.height, scene.width), initial, mask)
         source, asked = "painted: given as an array", (picture, *([] if mask is None else [mask]))
     elif chosen.kind == "image":
-        found = _painted_files(scene, initial, settings)
+        painted = _painted_files(scene, initial, settings)
         asked = tuple(np.fromfile(file, np.uint8) for file in (*chosen.files, *chosen.masks) if file)
         source = f"painted: {', '.join(chosen.files)}"
     else:
-        found = _painted_strokes(scene, initial, chosen)
+        painted = _painted_strokes(scene, initial, chosen)
         source = f"painted: {len(chosen.strokes)} strokes on the initial rendering"
     if chosen.kind == "image" and mask is None and not chosen.masks:
-        anew = rendered_anew.is_rendered_anew(
-            found.picture, initial, found.coverage, lambda: _again(scene, envmap, settings), scene.rows
-        )
-        if anew:
-            made = _of_rendering(settings, scene, envmap, picture, mask, FOUND_ANEW)
-            return _seen(made, hidden, settings.output.tonemap)
-    picture, warnings = found.picture, tuple(found.warnings)
+
+        def rendered_again():
+            spp, seed, cache = chosen.spp, Seeds.of(settings.seed).judged, settings.renderer.cache
+            return rendered(scene, envmap, spp, seed, cache)[0]
+
+        if rendered_anew.is_rendered_anew(
+            painted.picture, initial, painted.coverage, rendered_again, scene.rows
+        ):
+            return _of_rendering(settings, scene, envmap, picture, mask, FOUND_ANEW)
+    picture, warnings = painted.picture, painted.warnings
     if over := int((picture > BRIGHTEST).any(axis=2).sum()):
         # Squares and sums of what is more would leave single precision; on a display it is as white.
         picture = np.minimum(picture, np.float32(BRIGHTEST))
         warnings += (f"target: {over} pixels are brighter than {BRIGHTEST:.3g}: they count as that bright",)
-    coverage = found.coverage if hidden is None else np.where(hidden[..., None], 0, found.coverage)
-    if found.coverage.any() and not coverage.any():
+
+    # ---- How much each pixel counts
+    coverage = painted.coverage if hidden is None else np.where(hidden[..., None], 0, painted.coverage)
+    if painted.coverage.any() and not coverage.any():
         raise InputError(
             "target: all paint lies where no surface is seen (hide_emitters): paint on a surface"
         )
-    uncounted = found.excluded & (coverage[..., 0] > 0)  # what was not painted has the initial value
+    uncounted = painted.excluded & (coverage[..., 0] > 0)  # what was not painted has the initial value
     hold = first_hold(settings)
     weight = pixel_weight(coverage, uncounted if hidden is None else uncounted | hidden, chosen.paint, hold)
     share = 100 * float((coverage > 0).mean())
     source += f", {share:.3g} % of the pixels; weights {chosen.paint:g} (paint) and {hold:g} (the rest)"
-    made = Target(picture, weight, None, source, warnings, initial, coverage, asked)
-    return _seen(made, hidden, settings.output.tonemap)
-
-
-def _again(scene, envmap, settings):
-    """Render the map again as :func:`.initial_rendering.initial` does, with other samples."""
-    seed = Seeds.of(settings.seed).judged
-    return rendered(scene, envmap, settings.target.spp, seed, settings.renderer.cache)[0]
+    return Target(picture, weight, None, source, warnings, initial, coverage, asked)
 
 
 def _of_rendering(settings, scene, envmap, picture, mask, how=""):
@@ -294,7 +299,7 @@ def _painted_strokes(scene, initial, chosen):
         own = [i for i, number in enumerate(numbers) if number == k]
         made = strokes.paint(before, [chosen.strokes[i] for i in own], chosen.display_tonemap)
         warnings.extend(_renumbered(line, own) for line in made.warnings)
-        return painted_image.Painted(made.picture, made.coverage, np.zeros(before.shape[:2], bool), ())
+        return replace(made, excluded=np.zeros(before.shape[:2], bool), warnings=())
 
     found = _of_views(scene, initial, numbers, of_view)
     if not found.coverage.any():
@@ -316,14 +321,13 @@ def _of_views(scene, initial, painted, of_view):
             parts.append(of_view(k, before))
         else:
             shape = before.shape[:2]
-            parts.append(painted_image.Painted(
-                before, np.zeros((*shape, 1), np.float32), np.zeros(shape, bool), ()
-            ))  # fmt: skip
+            bare = np.zeros((*shape, 1), np.float32)
+            parts.append(strokes.Painted(before, bare, np.zeros(shape, bool)))
     picture, coverage, excluded = (
         np.concatenate([getattr(p, name) for p in parts]) for name in ("picture", "coverage", "excluded")
     )
-    said = tuple(line for part in parts for line in part.warnings)
-    return painted_image.Painted(picture, coverage, excluded, said)
+    warnings = tuple(line for part in parts for line in part.warnings)
+    return strokes.Painted(picture, coverage, excluded, warnings)
 
 
 def _seen(target, hidden, curve):

@@ -38,10 +38,6 @@ class Overview:
         """Average a picture (h, w, c) over blocks: (blocks, c)."""
         return _means(picture.reshape(-1, picture.shape[2]), self.block_of, np.ones(len(self.block_of)))
 
-    def to_cells(self, values: np.ndarray, weight: np.ndarray) -> np.ndarray:
-        """Average a map (H * W, c) over cells, weighted: (cells, c)."""
-        return _means(values, self.cell_of, weight)
-
 
 def make(matrix: ColourMatrix, shape: tuple[int, int], grid: tuple[int, int], views: Views = ()) -> Overview:
     """Sum up the entries of a transport.

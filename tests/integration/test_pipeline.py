@@ -17,6 +17,7 @@ from envedit import api, config, inputs, pipeline
 from envedit.core import color, interrupts, latlong
 from envedit.core.errors import InputError
 from envedit.images import analytic_sky, images
+from envedit.losses.perceptual import installed
 from envedit.representations.layers import gain
 from envedit.scene import scene
 from envedit.solve import (
@@ -474,7 +475,7 @@ def test_a_siren_says_how_to_get_weights_and_has_dists_where_they_are(tmp_path, 
     assert len(said) == 1 and "`envedit weights" in said[0] and "\n" not in said[0]
     assert not any("dists" in line.lower() for line in found.warnings)
     assert found.settings.loss.dists == 0 and "dists" not in found.history[0]
-    monkeypatch.setattr(pipeline, "_perceptual", lambda settings: (Stub(), None))
+    with_networks(monkeypatch, Stub(), None)
     (tmp_path / "weights").mkdir()
     there = {"perceptual": {"weights": str(tmp_path / "weights")}}
     found = pipeline.run(settings_of(tmp_path, sunny(rng), **few, **there))
@@ -501,9 +502,18 @@ class Stub:
         return float(np.mean(np.abs(a - b)))
 
 
+def with_networks(monkeypatch, dists, lpips):
+    """Let runs have networks without weights."""
+    monkeypatch.setattr(
+        installed,
+        "load",
+        lambda settings: installed.Networks(installed.settled(settings), dists, lpips, ""),
+    )
+
+
 @pytest.mark.slow
 def test_perceptual_terms_are_used_where_their_weights_are_named(tmp_path, rng, monkeypatch):
-    monkeypatch.setattr(pipeline, "_perceptual", lambda settings: (Stub(), Stub()))
+    with_networks(monkeypatch, Stub(), Stub())
     short = {
         "optimizer": {"iterations": 3},
         "loss": {"dists": 5.0, "change": 0.0},

@@ -176,18 +176,10 @@ def read_map(
     width: int | None = None,
     array: np.ndarray | None = None,
 ) -> InputMap:
-    """Read the map of a configuration.
+    """Read the map of a configuration, or take it from an ``array`` (H, 2 H, 3).
 
-    Parameters
-    ----------
-    settings : config.Input
-        Which map.
-    scene : Scene, optional
-        Whose own light and scale; None: none, and 1.
-    width : int, optional
-        Texels across; None: as many as the file has (of a map that is made: the working width).
-    array : ndarray (H, 2 H, 3), optional
-        The map itself, in place of the one that the configuration names.
+    ``scene`` is what its own light and scale are taken from; without one the scale is 1. The map has
+    ``width`` texels across, by default as many as its file (one that is made: the working width).
 
     Raises
     ------
@@ -236,16 +228,8 @@ def _by_hand(settings, input_map):
 def read_file(source: str | np.ndarray, width: int | None, settings: config.Input, scale: float) -> InputMap:
     """Read a map from its file, or take it from an array (H, 2 H, 3).
 
-    Parameters
-    ----------
-    source : str or ndarray
-        The file or the array.
-    width : int, optional
-        Texels across; None: as many as the file has.
-    settings : config.Input
-        ``repair``, ``unclip`` and ``colour_space`` count.
-    scale : float
-        What the scene multiplies it by.
+    It has ``width`` texels across, by default as many as the file; ``scale`` is what the scene multiplies it
+    by. Of the settings ``repair``, ``unclip`` and ``colour_space`` count.
 
     Raises
     ------
@@ -288,26 +272,9 @@ def _unclipped(input_map, width):
 
 
 def load_map(settings: config.Input, scene: Scene | None = None) -> tuple[np.ndarray, list[str]]:
-    """Load the map of a configuration at working width.
+    """Load the map of a configuration at working width: radiance (H, W, 3) in the scene, and warnings.
 
-    Parameters
-    ----------
-    settings : config.Input
-        Which map.
-    scene : Scene, optional
-        The scene whose own map and scale count.
-
-    Returns
-    -------
-    envmap : ndarray (H, W, 3) float32
-        Linear radiance that reaches the scene.
-    warnings : list of str
-        What was repaired, or is odd.
-
-    Raises
-    ------
-    ConfigError, InputError
-        As of :func:`read_map` and :class:`InputMap`.
+    Errors are those of :func:`read_map` and :attr:`InputMap.radiance`.
     """
     input_map = read_map(settings, scene, settings.width)
     return input_map.radiance, input_map.warnings

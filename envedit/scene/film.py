@@ -19,18 +19,9 @@ import numpy as np
 def render(scene: mi.Scene, integrator: mi.Integrator, spp: int, seed: int, view: int = 0) -> np.ndarray:
     """Render one sensor of a scene as ``mi.render`` does, with sums in a fixed order.
 
-    Parameters
-    ----------
-    scene : mi.Scene
-        Whose sensor; its film gives size, crop and filter.
-    integrator : mi.Integrator
-        A sampling integrator, such as ``path``.
-    spp : int
-        Samples a pixel; as many more as the sampler needs to fill its grid.
-    seed : int
-        Of the sampler.
-    view : int
-        Index of the sensor.
+    ``view`` is the sensor's index; its film gives size, crop and filter. ``integrator`` is a sampling one,
+    such as ``path``. There are ``spp`` samples a pixel, or as many more as the sampler needs to fill its
+    grid.
 
     Returns
     -------

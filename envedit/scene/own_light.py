@@ -42,17 +42,8 @@ class OwnLight:
     def map(self, width: int, to_world: np.ndarray) -> np.ndarray:
         """Return the texels that the emitter was given, or average its radiance over those of a map.
 
-        Parameters
-        ----------
-        width : int
-            Texels across, of a map that is made; its height is half of it.
-        to_world : array (3, 3)
-            Rotation from the map's frame to the scene's.
-
-        Returns
-        -------
-        ndarray (H, W, 3) float32
-            Linear radiance.
+        A map that is made is ``width`` texels wide and half as high; ``to_world`` (3, 3) is the rotation from
+        its frame to the scene's. Returned is linear radiance (H, W, 3) float32.
 
         Raises
         ------

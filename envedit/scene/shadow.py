@@ -17,19 +17,10 @@ PASSED = 16
 
 
 def occluder(scene: Scene, view: int, x: float, y: float, toward: np.ndarray) -> np.ndarray:
-    """Return the point that keeps a light from a place of a view.
+    """Return the point that keeps a light from a place of a view, (3,) float64 in the scene's coordinates.
 
-    Parameters
-    ----------
-    scene, view, x, y
-        As of :func:`.highlight.direction`.
-    toward : ndarray (3,)
-        Direction of the light in the frame of the map.
-
-    Returns
-    -------
-    ndarray (3,) float64
-        The first point, in the scene's own coordinates, that a ray from there towards the light hits.
+    It is the first that a ray from there ``toward`` the light, a direction (3,) in the frame of the map,
+    hits. Other parameters are those of :func:`.highlight.direction`.
 
     Raises
     ------
@@ -59,17 +50,8 @@ def occluder(scene: Scene, view: int, x: float, y: float, toward: np.ndarray) ->
 def direction(scene: Scene, view: int, x: float, y: float, point: np.ndarray) -> np.ndarray:
     """Return where a light must stand for the shadow of a point to lie at a place of a view.
 
-    Parameters
-    ----------
-    scene, view, x, y
-        As of :func:`occluder`.
-    point : ndarray (3,)
-        What :func:`occluder` returned.
-
-    Returns
-    -------
-    ndarray (3,) float64
-        Unit vector in the frame of the map.
+    ``point`` (3,) is what :func:`occluder` returned; other parameters and the return value are those of
+    :func:`.highlight.direction`.
 
     Raises
     ------

@@ -39,19 +39,8 @@ class Linearisation:
 class Derivatives:
     """Derivatives of the renderings of some unknowns; those of the last point are kept.
 
-    Parameters
-    ----------
-    unknowns : Unknowns
-        Of the layers.
-    transport : LightTransport
-        T; gets columns, with the fewest paths, for texels that a light covers.
-    blocks : BlockJacobian
-        T of blocks of pixels.
-
-    Attributes
-    ----------
-    angle : float
-        Rotation of the finite difference by a light's direction.
+    ``transport`` gets columns, with the fewest paths, for texels that a light covers; ``blocks`` is T of
+    blocks of pixels. ``angle`` is the rotation of the finite difference by a light's direction, radians.
     """
 
     def __init__(self, unknowns: Unknowns, transport: LightTransport, blocks: BlockJacobian):

@@ -151,16 +151,9 @@ def solve(
 
 
 def descended(problem: Problem, run: Run, point: Point, sigma: float = SIGMA, steps: int = 1) -> Point:
-    """Make a few steps from where a run is; the run goes along.
+    """Make at most some ``steps`` from where a run is, at ``point``, and return where they end.
 
-    Parameters
-    ----------
-    problem, run, sigma
-        As of :func:`solve`.
-    point : Point
-        Of the run's state.
-    steps : int
-        Most steps; the run may be finished before.
+    The run goes along; it may be finished before. Other parameters are those of :func:`solve`.
     """
     return _descended(problem, run, point, sigma, len(run.history) + steps, None)
 

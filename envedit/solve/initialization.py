@@ -54,25 +54,12 @@ def recordings(
     """Trace what lights are looked for through: T, and a second recording where detail is asked about.
 
     Where detail is identifiable, a gain fine enough for it follows the noise of T: a large picture, whose
-    pixels "auto" gives few samples each, gets as many as memory allows. On a mirror of 256x256 pixels the
-    map gains 1.6 dB over eight maps; without detail, pixels make up for each other.
+    pixels "auto" gives few samples each, gets as many as memory allows. On a mirror of 256x256 pixels the map
+    gains 1.6 dB over eight maps; without detail, pixels make up for each other. What is painted need not be
+    what any light does: detail would follow it, and is not asked about.
 
-    Parameters
-    ----------
-    settings : config.Config
-        Of the run.
-    scene : Scene
-        The scene.
-    shape : (int, int)
-        Rows and columns of the maps.
-    layers : Layers
-        The representation, after :meth:`.Layers.encode`.
-    target : Target
-        What the picture should be. What is painted need not be what any light does: detail would follow it.
-    traced : LightTransport, optional
-        T, where the run renders through it; of no use any more if another one is returned.
-    progress : callable, optional
-        Receives the blocks of pixels done, and all.
+    ``shape`` is (H, W) of the maps. ``traced`` is T, where the run renders through it; of no use any more if
+    another one is returned. ``progress`` receives the blocks of pixels done, and all.
     """
 
     def trace(seed, **changed):
@@ -120,14 +107,8 @@ def recordings(
 def trusted(envmap: np.ndarray, recordings: Recordings, target: Target) -> tuple[Target, list[str]]:
     """Weigh a rendered target's pixels by what is known of them under a map; returns the target and notes.
 
-    Parameters
-    ----------
-    envmap : ndarray (H, W, 3)
-        The map as far as it is solved: images of lights, and caustics, are where the lights now are.
-    recordings : Recordings
-        Of :func:`recordings`, with a second one; their bright columns may change.
-    target : Target
-        What the picture should be.
+    ``envmap`` (H, W, 3) is the map as far as it is solved: images of lights, and caustics, are where the
+    lights now are. ``recordings`` has a second one; the bright columns of both may change.
     """
     pictures = []
     for one in (recordings.transport, recordings.second):

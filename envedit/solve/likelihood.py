@@ -58,12 +58,8 @@ class Likelihood:
     ) -> Likelihood:
         """Return the likelihood of a painted picture; its rest counts for as much as it weighs beside paint.
 
-        Parameters
-        ----------
-        weight, coverage : ndarray (h, w, 1)
-            How much each pixel counts, and was painted.
-        initial, picture : ndarray (h, w, 3)
-            What was painted on, and the painted picture, linear radiance.
+        ``weight`` and ``coverage`` (h, w, 1) say how much each pixel counts, and was painted; ``initial`` and
+        ``picture`` (h, w, 3) are what was painted on, and the painted picture, linear radiance.
         """
         # Weights are a c + b (1 - c): b is that of pixels without paint.
         bare = weight[(coverage <= 0) & (weight > 0)]

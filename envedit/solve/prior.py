@@ -82,13 +82,7 @@ class Prior:
 
         With :attr:`freedom` the nodes of the finest grid differ as photographed skies do, times freedom, and
         coarser grids, which it contains, stay at 0; without, every node has its own standard deviation.
-
-        Parameters
-        ----------
-        gain : GridGain
-            Whose nodes these are.
-        ground : bool
-            The last node is the factor of ground, which changes as a coarse node of the sky.
+        ``ground``: the last node is the factor of ground, which changes as a coarse node of the sky.
         """
         coarse = [rows * columns for rows, columns in gain.sizes]
         if self.freedom is None:
@@ -116,17 +110,11 @@ class Prior:
 
 
 def of_paint(freedom: float, coverage: np.ndarray | None = None) -> Prior:
-    """Return the prior of painted targets.
+    """Return the prior of painted targets, of a freedom in units of how photographed skies differ.
 
     Paint that asks for another brightness is no reason for another colour of a light: a third of what a
-    rendered target may change. One factor for the whole sky is as free as the picture is painted.
-
-    Parameters
-    ----------
-    freedom : float
-        How far the gain may go, in units of how photographed skies differ.
-    coverage : ndarray (h, w, 1), optional
-        How much each pixel was painted; None: nothing was.
+    rendered target may change. One factor for the whole sky is as free as the picture is painted:
+    ``coverage`` (h, w, 1) is how much each pixel was, None: nothing.
     """
     painted = 0.0 if coverage is None else float(coverage.mean(dtype=np.float64))
     factor = max(LEAST_WHOLE_FREEDOM, freedom, painted)

@@ -92,20 +92,10 @@ def search(
     after_step: Callable[[], None] | None = None,
     most: int = EXPLANATION_STEPS,
 ) -> Explanation:
-    """Find the likeliest explanation.
+    """Find the likeliest explanation, from ``start``, the state of the map as it is.
 
-    Parameters
-    ----------
-    problem : Problem
-        Of a rendered or a painted target.
-    start : dict
-        State of the map as it is.
-    sigma : float
-        Least standard error of display values.
-    after_step : callable, optional
-        Called now and then; what it raises ends the search.
-    most : int
-        Most Gauss-Newton steps after which explanations are compared.
+    ``sigma`` is the least standard error of display values, ``most`` bounds the Gauss-Newton steps after
+    which explanations are compared. ``after_step`` is called now and then; what it raises ends the search.
     """
     steps = min(most, EXPLANATION_STEPS)
     best = _descended(problem, {}, gauss_newton.Run(start, start), sigma, steps)
@@ -129,12 +119,7 @@ def further(
 ) -> Explanation | None:
     """Find an explanation that is likelier than a solution, whose sky it begins with; None if there is none.
 
-    Parameters
-    ----------
-    problem, sigma, after_step
-        As for :func:`search`.
-    run : Run
-        Where no step leads further.
+    ``run`` is where no step leads further; other parameters are those of :func:`search`.
     """
     point = problem.evaluate(run.state, resolve=False)
     best = Explanation({}, run, point, score(problem, run, point, sigma))

@@ -87,26 +87,11 @@ def _clipped(shown):
 def export(
     file: FilePath, picture: np.ndarray, settings: config.Config, name: str | None = None
 ) -> list[str]:
-    """Write the picture to paint on: float32 OpenEXR, or 16-bit PNG.
+    """Write the picture to paint on, (h, w, 3) linear radiance; returns warnings.
 
-    The file says which tonemap it is under, and what it was rendered from. As editors drop that, a file
-    beside it, with :data:`NEIGHBOUR` after its name, says it too.
-
-    Parameters
-    ----------
-    file : path-like
-        Ends in .exr or .png, and is not there yet.
-    picture : ndarray (h, w, 3)
-        Linear radiance, of :func:`initial`.
-    settings : config.Config
-        What it was made from.
-    name : str, optional
-        Its tonemap; by default that of :func:`export_tonemap`.
-
-    Returns
-    -------
-    list of str
-        Warnings.
+    It is float32 OpenEXR, or 16-bit PNG. The file says which tonemap it is under (``name``, by default
+    :func:`export_tonemap`), and what it was rendered from. As editors drop that, a file beside it, with
+    :data:`NEIGHBOUR` after its name, says it too.
 
     Raises
     ------
@@ -138,17 +123,7 @@ def export(
 
 
 def origin(settings: config.Config, shape: Shape, name: str) -> Info:
-    """Return what an exported picture says of itself.
-
-    Parameters
-    ----------
-    settings : config.Config
-        What it is made from.
-    shape : tuple
-        (h, w, ...) of the picture.
-    name : str
-        Its tonemap.
-    """
+    """Return what an exported picture (h, w, ...) under a tonemap of this name says of itself."""
     return {
         "tonemap": name,
         "scene": Path(settings.scene.file).name,
@@ -165,21 +140,9 @@ def stated_origin(file: FilePath, info: Info, expected: Mapping[str, object]) ->
     """Return what a painted picture was exported with, as its metadata or a file beside it says.
 
     The file beside it is the one with its name, where it was saved over the export; otherwise, of those in
-    its folder that are of the same scene, one that agrees with this run, or else the first.
-
-    Parameters
-    ----------
-    file : path-like
-        The picture.
-    info : dict
-        Of :func:`envedit.images.images.read_stored`.
-    expected : mapping
-        What an export of this run says (:func:`origin`).
-
-    Returns
-    -------
-    dict
-        As :func:`origin`, values as text; empty where nothing is said.
+    its folder that are of the same scene, one that agrees with this run, or else the first. ``info`` is of
+    :func:`envedit.images.images.read_stored`, ``expected`` what an export of this run says. What is returned
+    is as :func:`origin`, values as text; empty where nothing is said.
 
     Raises
     ------

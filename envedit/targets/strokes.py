@@ -267,17 +267,10 @@ def _blurred(values, sigma, axis):
 
 
 def membrane(values: np.ndarray, unknown: np.ndarray) -> np.ndarray:
-    """Replace pixels by the membrane through those around them: each is the mean of its neighbours.
+    """Replace ``unknown`` pixels (h, w) of a picture (h, w, C) by the membrane through those around them.
 
-    The discrete Laplace equation, with no flow across the picture's border, by conjugate gradients; to about
-    1e-6 of the largest value.
-
-    Parameters
-    ----------
-    values : ndarray (h, w, C) float64
-        The picture.
-    unknown : ndarray of bool (h, w)
-        Pixels to replace; not all.
+    Each is the mean of its neighbours: the discrete Laplace equation, with no flow across the picture's
+    border, by conjugate gradients; to about 1e-6 of the largest value. Some pixel must be known.
     """
     row, column = np.nonzero(unknown)
     height, width = unknown.shape

@@ -380,26 +380,11 @@ def _rendered(settings, scene, envmap, other):
 def with_noise(
     settings: config.Config, scene: Scene, envmap: np.ndarray
 ) -> tuple[np.ndarray, int, np.ndarray]:
-    """Render a target.
+    """Render a target under a map (H, W, 3), with samples, seed and cache of the configuration.
 
-    Parameters
-    ----------
-    settings : config.Config
-        Samples, seed and cache.
-    scene : Scene
-        The scene.
-    envmap : ndarray (H, W, 3)
-        The map that it is rendered under.
-
-    Returns
-    -------
-    picture : ndarray (h, w, 3)
-        Linear radiance.
-    spp : int
-        Samples a pixel that were taken.
-    noise : ndarray (h, w)
-        Standard error of display values, RMS over channels; where it is not known from passes,
-        |d1 - d2| / sqrt(2), with d2 a second rendering with as many samples.
+    Returned are the picture (h, w, 3), linear radiance, the samples a pixel that were taken, and the standard
+    error (h, w) of display values, RMS over channels: where it is not known from passes, |d1 - d2| / sqrt(2),
+    with d2 a second rendering with as many samples.
     """
     asked, seeds, keep = settings.target.spp, Seeds.of(settings.seed), settings.renderer.cache
     picture, spp, noise = rendered(scene, envmap, asked, seeds.target, keep)

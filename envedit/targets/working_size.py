@@ -62,21 +62,11 @@ def scaled(scene: Scene, factor: float) -> Scene | None:
 def worked_on(
     settings: config.Config, scene: Scene, small: Scene, envmap: np.ndarray, target: Target
 ) -> Target:
-    """Return the target (of ``scene``) as the picture of a smaller scene.
+    """Return the target of a scene as the picture of the ``small`` scene, the same on a smaller film.
 
     It is rendered anew, so that the film's filter is the same as in what it is compared with. What was
-    painted is the change of each pixel, averaged over its area and added to the smaller initial rendering.
-
-    Parameters
-    ----------
-    settings : config.Config
-        Of the run.
-    scene, small : Scene
-        The scene, and it on a smaller film.
-    envmap : ndarray (H, W, 3)
-        The map that is edited.
-    target : Target
-        What was asked for.
+    painted is the change of each pixel, averaged over its area and added to the smaller initial rendering,
+    under ``envmap`` (H, W, 3), the map that is edited.
     """
     chosen = settings.target
     hidden = np.zeros((small.height, small.width), bool) if small.alpha is None else small.alpha == 0

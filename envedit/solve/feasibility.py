@@ -29,7 +29,6 @@ import numpy as np
 
 from envedit.core.arrays import tensor
 from envedit.core.color import tonemap
-from envedit.core.errors import InputError, place_of
 from envedit.core.rows import Rows
 from envedit.core.seeds import SIGNS
 from envedit.solve.likelihood import STATEMENTS, Likelihood, on_average_one
@@ -138,13 +137,6 @@ def reachable(
     -------
     Reach
 
-    Raises
-    ------
-    InputError
-        A pixel of the target is not finite.
-    ValueError
-        Shapes do not match, or nothing is painted or counts.
-
     Notes
     -----
     A target that was rendered has noise of its own, which is out of reach: under a map that is known to make
@@ -192,20 +184,14 @@ class _Request:
 
     @classmethod
     def of(cls, transport, original, target, likelihood, painted, rendered):
-        shape = transport.shape
-        target = _shaped("target", target, (*shape, 3))
-        if (bad := ~np.isfinite(target)).any():
-            raise InputError(f"target: pixel at {place_of(bad)} is not finite: repair it before painting")
-        likelihood = likelihood or Likelihood(on_average_one(None, shape))
-        counts = (_shaped("weight", likelihood.weight, (*shape, 1))[..., 0] > 0).astype(np.float64)
-        painted = counts if painted is None else _shaped("painted", painted, shape)
-        if not (painted.sum() > 0 and counts.sum() > 0):
-            raise ValueError("reachable: no pixel is painted or counts")
+        target = target.astype(np.float64)
+        likelihood = likelihood or Likelihood(on_average_one(None, transport.shape))
+        painted = likelihood.weight[..., 0] > 0 if painted is None else painted
         transport.resolve(original)
         initial = _rendering(transport, original)
         if rendered is not None:
-            target = target + initial - _shaped("rendered", rendered, (*shape, 3))
-        return cls(initial, np.maximum(target, 0), likelihood, painted)
+            target = target + initial - rendered
+        return cls(initial, np.maximum(target, 0), likelihood, painted.astype(np.float64))
 
     def distance(self, picture):
         """Mean absolute difference of display values in the painted region."""
@@ -235,13 +221,6 @@ class _Request:
         sigma = self.likelihood.paint_noise or 0.0
         scale = sigma * np.sqrt(STATEMENTS * self.likelihood.area / beyond)
         return scale * self.likelihood.share * self.slope(picture)
-
-
-def _shaped(name, values, shape):
-    values = np.asarray(values, np.float64)
-    if values.shape != shape:
-        raise ValueError(f"reachable: {name} must have shape {shape}, got {values.shape}")
-    return values
 
 
 def _rendering(transport, envmap):

@@ -136,8 +136,8 @@ def solve(
         before = replace(run, state=start, start=start)
         first = problem.evaluate(start, resolve=False)
         loss = _unlikeliness(problem, run, point, sigma) + 2 * normal.determined
-        noise = problem.noise(point.residual, sigma)
-        near = problem.noise(first.residual, sigma) < COMPARED_NOISE_RATIO * noise
+        noise = problem.likelihood.noise(point.residual, sigma)
+        near = problem.likelihood.noise(first.residual, sigma) < COMPARED_NOISE_RATIO * noise
         if _unlikeliness(problem, before, first, sigma) <= loss:
             note = "kept the initialisation: the better match of the rendering does not justify "
             note += f"{normal.determined:.0f} parameters (Akaike criterion)"
@@ -159,12 +159,12 @@ def descended(problem: Problem, run: Run, point: Point, sigma: float = SIGMA, st
 
 
 def _normal(problem, run, point, sigma):
-    return problem.normal(point, run.start, problem.noise(point.residual, sigma), descent=False)
+    return problem.normal(point, run.start, problem.likelihood.noise(point.residual, sigma), descent=False)
 
 
 def _unlikeliness(problem, run, point, sigma):
     """Return -2 log posterior at the noise that the residual shows, but for a constant."""
-    noise = problem.noise(point.residual, sigma)
+    noise = problem.likelihood.noise(point.residual, sigma)
     return problem.loss(point, run.start, noise) + 6 * problem.likelihood.independent * float(np.log(noise))
 
 
@@ -174,7 +174,7 @@ def _descended(problem, run, point, sigma, most, after_step):
         began = time.perf_counter()
 
         # ---- Huber's threshold: the noise, at most halved at once
-        noise = problem.noise(point.residual, sigma)
+        noise = problem.likelihood.noise(point.residual, sigma)
         halved = run.scale / 2 if np.isfinite(run.scale) else 0
         run.scale = min(run.scale, max(noise, halved))
 
@@ -189,7 +189,7 @@ def _descended(problem, run, point, sigma, most, after_step):
 
         # ---- Whether it is the last one
         little = better is None or before - loss < LEAST_DECREASE * before
-        ended = little and run.scale <= 1.01 * problem.noise(point.residual, sigma)
+        ended = little and run.scale <= 1.01 * problem.likelihood.noise(point.residual, sigma)
         run.finished = ended and (run.wide or not problem.shining(run.state))
         if ended and not run.wide:  # other derivatives: what damping those needed says nothing of them
             run.wide, run.damping = True, Run.damping
@@ -240,7 +240,7 @@ def _lower(problem, run, point, normal):
         state = problem.step(run.state, normal, run.damping)
         there = None if state is None else problem.evaluate(state)
         if there is not None and there.residual is not None:
-            misfit = problem.misfit(there.residual, run.scale)
+            misfit = problem.likelihood.misfit(there.residual, run.scale)
             trial = _Trial(there, misfit, problem.penalty(there.state, run.start))
             if trial.loss >= before:
                 again = problem.evaluate(run.state, resolve=False)

@@ -39,7 +39,6 @@ class Recordings:
     # Detail that the picture determines; see :func:`.gain_bandwidth.octaves`
     octaves: list[Octave] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)  # what was found and chosen
-    views: tuple[slice, ...] = ()  # rows of each view
 
 
 def recordings(
@@ -83,8 +82,15 @@ def recordings(
         memory_gb=recording.gigabytes(pixels, few, min(SECOND_COLUMNS, transport.capacity) + 1),
         refresh=0,
     )
-    asked = layers.separation.background, layers.rows, target.picture, target.weight
-    octaves = gain_bandwidth.octaves(transport, second, *asked, 2 * CYCLES)
+    octaves = gain_bandwidth.octaves(
+        transport,
+        second,
+        layers.separation.background,
+        layers.rows,
+        target.picture,
+        target.weight,
+        2 * CYCLES,
+    )
     shares = ", ".join(f"{100 * octave.share:.0f} % at {octave.cycles} cycles" for octave in octaves)
     least = f"below {100 * gain_bandwidth.FIRST_SHARE:.0f} % at {2 * CYCLES} cycles"
     notes = [f"sky area with identifiable detail: {shares or least}"]
@@ -101,7 +107,7 @@ def recordings(
             transport = trace(settings.seed, spp=most)
     # Columns of both are compared: their paths are in the ratio of the samples.
     second.paths = tuple(max(1, round(n * second.spp / transport.spp)) for n in transport.paths)
-    return Recordings(transport, second, octaves, notes, scene.rows)
+    return Recordings(transport, second, octaves, notes)
 
 
 def trusted(envmap: np.ndarray, recordings: Recordings, target: Target) -> tuple[Target, list[str]]:
@@ -116,13 +122,13 @@ def trusted(envmap: np.ndarray, recordings: Recordings, target: Target) -> tuple
         pictures.append(one.apply(mi.TensorXf(envmap)).numpy())
     share = recordings.second.spp / recordings.transport.spp
     first, second = pictures
-    asked = target.picture, target.noise, recordings.views
-    weight = pixel_confidence.weights(first, second, share, *asked)
+    views = recordings.transport.scene.rows
+    weight = pixel_confidence.weights(first, second, share, target.picture, target.noise, views)
     if weight is None:
         return target, []
     noisy = 100 * float((weight < 0.5).mean())
-    said = f"{noisy:.3g} % of the pixels are dominated by Monte Carlo noise and down-weighted"
+    note = f"{noisy:.3g} % of the pixels are dominated by Monte Carlo noise and down-weighted"
     weight = weight if target.weight is None else weight * target.weight
     if not weight.any():  # a mask around nothing but noise: better that than nothing
         return target, []
-    return replace(target, weight=(weight / max(float(weight.mean()), 1e-30)).astype(np.float32)), [said]
+    return replace(target, weight=(weight / max(float(weight.mean()), 1e-30)).astype(np.float32)), [note]

@@ -180,13 +180,9 @@ class Problem(Unknowns):
             return slope
         return np.where(self.photo.clipped & (point.residual >= 0), 0, slope).astype(np.float32)
 
-    def noise(self, residual: np.ndarray, least: float) -> float:
-        """Return the most likely standard error (:meth:`.Likelihood.noise`)."""
-        return self.likelihood.noise(residual, least)
-
     def loss(self, point: Point, start: dict, sigma: float) -> float:
         """Return F."""
-        return self.misfit(point.residual, sigma) + self.penalty(point.state, start)
+        return self.likelihood.misfit(point.residual, sigma) + self.penalty(point.state, start)
 
     def penalty(self, state: dict, start: dict) -> float:
         """Return x' K x; ``start`` is where the search has put the lights."""
@@ -209,10 +205,6 @@ class Problem(Unknowns):
 
     def _angle(self, state, start, i):
         return float(np.linalg.norm(rotation_between(self.direction(start, i), self.direction(state, i))))
-
-    def misfit(self, residual: np.ndarray, sigma: float) -> float:
-        """Return the first part of F."""
-        return self.likelihood.misfit(residual, sigma)
 
     # ---- normal equations ----------------------------------------------------------------------------------
 

@@ -145,7 +145,7 @@ def _others(best, compared):
 def _unfollowed(problem, best, sigma):
     """Whether paint is followed so little that its noise is the largest there may be."""
     most = problem.likelihood.paint_noise
-    return most is not None and problem.noise(best.point.residual, sigma) >= most
+    return most is not None and problem.likelihood.noise(best.point.residual, sigma) >= most
 
 
 def _neighbours(problem, best, moves, sigma, after_step, steps, sky):
@@ -172,7 +172,7 @@ def score(problem: Problem, run: gauss_newton.Run, point: Point, sigma: float) -
     if point.residual is None:
         return np.inf
     # ---- -2 log of likelihood and prior, at the most likely noise
-    noise = problem.noise(point.residual, sigma)
+    noise = problem.likelihood.noise(point.residual, sigma)
     unlikeliness = problem.likelihood.at_best(point.residual, sigma) + problem.penalty(run.state, run.start)
     # ---- log det H - log det K
     normal = problem.normal(point, run.start, noise, descent=False)
@@ -256,7 +256,9 @@ def _places(problem, state, start, sigma):
     if point.residual is None:
         return None
     try:
-        return Places(problem, point, problem.normal(point, start, problem.noise(point.residual, sigma)))
+        return Places(
+            problem, point, problem.normal(point, start, problem.likelihood.noise(point.residual, sigma))
+        )
     except np.linalg.LinAlgError:
         return None
 

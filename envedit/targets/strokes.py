@@ -42,7 +42,6 @@ import numpy as np
 
 from envedit.config.stroke_schema import StrokeList
 from envedit.core.color import inverse_tonemap, luminance, tonemap
-from envedit.core.errors import InputError, place_of
 from envedit.targets.stroke_shapes import coverage
 
 __all__ = ["Painted", "paint"]
@@ -80,10 +79,8 @@ def paint(picture: np.ndarray, strokes: Sequence[dict], tonemap: str = "gamma") 
     ------
     ConfigError
         If a stroke or the tonemap cannot be understood.
-    InputError
-        If the picture has another shape or a pixel that is not finite.
     """
-    image = _checked(picture)
+    image = np.asarray(picture, np.float32)
     display = Display(tonemap)
     height, width, _ = image.shape
     result = image.astype(np.float64)
@@ -110,20 +107,6 @@ def paint(picture: np.ndarray, strokes: Sequence[dict], tonemap: str = "gamma") 
     total = (1 - bare).astype(np.float32)
     picture = np.where(total > 0, result.astype(np.float32), image)
     return Painted(picture, total, warnings=tuple(warnings))
-
-
-def _checked(picture):
-    """Return a picture in float32."""
-    image = np.asarray(picture)
-    if image.ndim != 3 or image.shape[2] != 3 or not image.size or image.dtype.kind not in "fiu":
-        raise InputError(
-            f"picture to paint on: got shape {image.shape} of {image.dtype}, expected (h, w, 3) numbers"
-        )
-    with np.errstate(over="ignore"):  # a float64 too large for float32 becomes inf, and is named below
-        image = image.astype(np.float32)
-    if (bad := ~np.isfinite(image)).any():
-        raise InputError(f"picture to paint on: pixel at {place_of(bad)} is not finite: repair it")
-    return image
 
 
 # ------------------------------------------------------------------------------------------------------------

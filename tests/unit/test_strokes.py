@@ -8,7 +8,7 @@ import pytest
 from envedit import config as cfg
 from envedit.config.stroke_schema import STROKES, StrokeList
 from envedit.core.color import TONEMAPS, inverse_tonemap, luminance, tonemap
-from envedit.core.errors import ConfigError, InputError
+from envedit.core.errors import ConfigError
 from envedit.targets import stroke_shapes, strokes
 from tests.oracles import ROOT
 from tests.oracles.builders import grey, refused
@@ -380,20 +380,6 @@ def test_strokes_that_paint_nothing_say_so():
     assert "target.strokes[0] (shadow)" in outside and "outside the 16x8 picture" in outside
     assert "target.strokes[1] (light)" in also and "target.strokes[4]" in far
     assert "opacity 0" in unseen and "target.strokes[3] (erase-shadow): covers the whole picture" in all_of_it
-
-
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e39])
-def test_a_picture_that_is_not_finite_is_refused_by_place(bad):
-    picture = grey(0.5).astype(np.float64)
-    picture[3, 7, 1] = bad
-    with pytest.raises(InputError, match="pixel at row 3, column 7 is not finite"):
-        strokes.paint(picture, [])
-
-
-@pytest.mark.parametrize("picture", [np.zeros((4, 4)), np.zeros((0, 4, 3)), np.zeros((4, 4, 4)), [["a"]]])
-def test_a_picture_of_another_shape_is_refused(picture):
-    with pytest.raises(InputError, match=r"got shape \(.*expected \(h, w, 3\)"):
-        strokes.paint(picture, [])
 
 
 def test_an_unknown_tonemap_is_refused():

@@ -192,12 +192,3 @@ def test_a_black_picture_makes_a_dark_sky(transport):
 @pytest.mark.slow
 def test_a_sun_below_the_rows_that_may_change_is_no_light_to_move(transport):
     assert Found(transport(), sky((20, 7)), picture(transport(), sky())).own == 0
-
-
-@pytest.mark.slow
-def test_the_same_question_has_the_same_answer_to_the_bit(transport, moved):
-    wanted, first = moved
-    again = Found(transport(), sky(SUN), wanted)
-    assert first.name == again.name and first.decoded.tobytes() == again.decoded.tobytes()
-    for name in first.state:
-        assert first.state[name].tobytes() == again.state[name].tobytes(), name

@@ -20,7 +20,7 @@ from envedit.solve import checkpoint, gauss_newton, light_places, map_problem, s
 from envedit.solve.adam_loop import State
 from envedit.solve.derivatives import NARROW_ANGLE
 from envedit.solve.gauss_newton import Run, solve
-from envedit.solve.likelihood import INDEPENDENT, Likelihood, on_average_one
+from envedit.solve.likelihood import Likelihood, on_average_one
 from envedit.solve.map_problem import Problem
 from envedit.solve.prior import PHOTOGRAPHED, Prior, of_paint
 from envedit.targets.pixel_weights import pixel_weight
@@ -508,17 +508,6 @@ def test_deviation_shrinks_with_what_is_known(rng):
     upper, lower = found["half", 0.02][:9].mean(), found["half", 0.02][-9:].mean()
     assert upper < 0.7 * lower
     assert target.any()
-
-
-@pytest.mark.slow
-def test_deviation_does_not_exceed_the_priors_at_the_default_gain(rng):
-    image, transport = clouds(rng), DenseTransport.random(rng, (24, 24), GRID, even=0.8)
-    problem, params = problem_of(image, transport, shown(transport, image), cycles=12)
-    start = problem.state(params)
-    normal = problem.normal(problem.evaluate(start), start, map_problem.SIGMA)
-    deviation = problem.posterior(start, normal).deviation
-    assert np.isfinite(deviation).all() and (deviation > 0).all()
-    assert (deviation <= prior_deviation(problem) * (1 + 1e-4)).all()
 
 
 # ---- steps -------------------------------------------------------------------------------------------------
@@ -1174,25 +1163,6 @@ def test_saturation_comes_back_from_a_checkpoint_of_its_state(rng):
 
 
 # ---- pixels that do not count -----------------------------------------------------------------------------
-
-
-def test_pixels_that_count_are_the_whole_picture(rng):
-    """Where a mask takes nine tenths of the picture away, the noise is that of the rest."""
-    image, transport = clouds(rng), DenseTransport.random(rng, FILM, GRID)
-    mask = np.zeros((*FILM, 1), np.float32)
-    mask[: max(1, FILM[0] // 10)] = 0.5
-    residual = 0.03 * rng.normal(size=(*FILM, 3))
-    counted = Likelihood(on_average_one(mask, FILM))
-    problem, params = problem_of(image, transport, shown(transport, image), counted)
-    of_all, _ = problem_of(image, transport, shown(transport, image))
-    inside = np.where(mask > 0, residual, 0)
-    assert problem.likelihood.weight.mean() == pytest.approx(1)
-    assert of_all.noise(residual, 0.001) == pytest.approx(problem.likelihood.noise(inside, 0.001), rel=0.3)
-    point = problem.evaluate(problem.state(params))
-    again = Likelihood(on_average_one(7 * mask, FILM))
-    aimed = problem.aimed_at(shown(transport, image), again, point)
-    assert problem.likelihood is again and aimed.residual.shape == residual.shape
-    assert problem.likelihood.noise(inside, 0.001) == pytest.approx(counted.noise(inside, 0.001), rel=1e-6)
 
 
 def test_problems_of_one_job_share_their_blocks_and_nothing_else(rng):

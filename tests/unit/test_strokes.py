@@ -110,18 +110,6 @@ def test_an_ellipse_turns_from_x_towards_y():
     np.testing.assert_allclose(wide, tall, atol=1e-6)
 
 
-def test_the_distance_to_an_ellipse_is_that_to_its_nearest_point(rng):
-    radii = np.array([3.0, 0.7])
-    t = np.linspace(0, 2 * np.pi, 20001)
-    edge = np.stack([radii[0] * np.cos(t), radii[1] * np.sin(t)], axis=-1)
-    points = np.concatenate([rng.uniform(-4, 4, (60, 2)), [[0, 0], [2.9, 0], [0, 0.5], [3.5, 0], [1, 0]]])
-    nearest = np.array([np.sqrt(((edge - p) ** 2).sum(axis=1).min()) for p in points])
-    inside = ((points / radii) ** 2).sum(axis=1) < 1
-    np.testing.assert_allclose(
-        stroke_shapes._to_ellipse(points, radii), np.where(inside, -nearest, nearest), atol=1e-5
-    )
-
-
 def test_a_soft_edge_is_a_smooth_step_half_inside_and_half_outside():
     c = covered(101, rectangle=[20.5, -200, 400, 400], softness=20, units="pixels")[50]
     assert c[20] == pytest.approx(0.5) and c[9] == 0 and c[31] == 1
@@ -250,13 +238,6 @@ def test_black_bodies_have_the_colours_of_the_literature():
     for kelvin, x, y in ((2000, 0.5267, 0.4133), (2856, 0.4476, 0.4074), (6500, 0.3135, 0.3237)):
         np.testing.assert_allclose(strokes.chromaticity(kelvin), (x, y), atol=6e-4)
     assert (strokes.gains(2000) > 0).all()
-
-
-def test_temperature_is_the_same_factor_for_every_pixel(rng):
-    """So that a map under those gains answers it exactly."""
-    picture = (0.1 + rng.random((8, 8, 3))).astype(np.float32)
-    ratio = painted(picture, type="temperature", kelvin=4000) / picture
-    np.testing.assert_allclose(ratio, np.broadcast_to(ratio[0, 0], ratio.shape), rtol=1e-5)
 
 
 def test_contrast_is_a_factor_about_the_mean_of_display_values(rng):

@@ -29,16 +29,6 @@ def change(rendering: np.ndarray, aim: np.ndarray, coverage: np.ndarray, counts:
     return float(np.abs(tonemap(rendering[rest]) - tonemap(aim[rest])).mean())
 
 
-def raised(hold: float, changed: float) -> float | None:
-    """Return a larger weight of what was not painted; None if it has changed too little for that.
-
-    Residuals count by their squares: the weight grows with the square of the change.
-    """
-    if changed <= VISIBLE or hold >= LARGEST_HOLD:
-        return None
-    return min(LARGEST_HOLD, hold * float(np.clip((changed / VISIBLE) ** 2, LEAST_RAISE, LARGEST_RAISE)))
-
-
 def said(weight: float, changed: float) -> str:
     """Say with which weight an edit ended; ``changed`` is the :func:`change` of what was not painted."""
     used = f"target.hold = {weight:.3g} was used"
@@ -55,9 +45,14 @@ def further(
 ) -> float | None:
     """Return the weight with which an edit goes on; None where it need not, or where the weight was given.
 
+    Residuals count by their squares: the weight grows with the square of the change, if that is visible.
     ``chosen`` is table ``[target]``, ``weight`` that of what was not painted, in the steps that led to
     ``rendering``; further arguments are those of :func:`change`.
     """
     if chosen.hold != "auto" or chosen.rest == "follow" or not chosen.paint:
         return None
-    return raised(weight, change(rendering, aim, *pixels))
+    changed = change(rendering, aim, *pixels)
+    if changed <= VISIBLE or weight >= LARGEST_HOLD:
+        return None
+    factor = float(np.clip((changed / VISIBLE) ** 2, LEAST_RAISE, LARGEST_RAISE))
+    return min(LARGEST_HOLD, weight * factor)

@@ -150,31 +150,31 @@ def stated_origin(file: FilePath, info: Info, expected: Mapping[str, object]) ->
         If a value of :data:`KEYS` is not that of this run: the rendering is not the one that was painted on.
     """
     file = Path(os.fsdecode(file))
-    said = {k[len(_PREFIX) :]: str(v) for k, v in info["metadata"].items() if k.startswith(_PREFIX)}
+    facts = {k[len(_PREFIX) :]: str(v) for k, v in info["metadata"].items() if k.startswith(_PREFIX)}
     neighbour = None
-    if not said:
-        said, neighbour = _beside(file, expected)
+    if not facts:
+        facts, neighbour = _beside(file, expected)
         if neighbour is not None and (info["hdr"] or neighbour.name.lower().endswith(f".exr{NEIGHBOUR}")):
-            said.pop("tonemap", None)  # of another format
-    if keys := _differing(said, expected):
-        stated = ", ".join(f"{KEYS[key]} {said[key][:20]!a}".replace("'", "") for key in keys)
+            facts.pop("tonemap", None)  # of another format
+    if keys := _differing(facts, expected):
+        stated = ", ".join(f"{KEYS[key]} {facts[key][:20]!a}".replace("'", "") for key in keys)
         own = ", ".join(str(expected[key]) for key in keys)
         source = "was" if neighbour is None else f"{neighbour.name} says that it was"
         remedy = "give these to this run, or export it again"
         remedy += "" if neighbour is None else f"; if it is no such picture, remove {neighbour.name}"
         raise InputError(f"{file}: {source} exported with {stated}, where this run has {own}: {remedy}")
-    return said
+    return facts
 
 
-def _differing(said, expected):
+def _differing(facts, expected):
     """Return the keys of :data:`KEYS` whose values differ."""
-    return [key for key in KEYS if key in said and said[key] != str(expected.get(key, said[key]))]
+    return [key for key in KEYS if key in facts and facts[key] != str(expected.get(key, facts[key]))]
 
 
 def _beside(file, expected):
     """Return what a file beside a picture says of its export, and the file; {} and None without one."""
     own = file.with_name(f"{file.name}{NEIGHBOUR}")
-    found = {}
+    stated = {}
     for path in filter(os.path.isfile, (own, *sorted(file.parent.glob(f"*{NEIGHBOUR}")))):
         try:
             with open(path, "rb") as stream:
@@ -182,9 +182,9 @@ def _beside(file, expected):
         except (OSError, ValueError, RecursionError):  # no JSON, or none of ours
             continue
         if isinstance(facts, dict) and (path == own or facts.get("scene") == expected.get("scene")):
-            found[path] = {str(key): str(value) for key, value in facts.items()}
-    if not found:
+            stated[path] = {str(key): str(value) for key, value in facts.items()}
+    if not stated:
         return {}, None
-    agreeing = [path for path, facts in found.items() if not _differing(facts, expected)]
-    chosen = own if own in found else (agreeing or list(found))[0]
-    return found[chosen], chosen
+    agreeing = [path for path, facts in stated.items() if not _differing(facts, expected)]
+    chosen = own if own in stated else (agreeing or list(stated))[0]
+    return stated[chosen], chosen

@@ -206,7 +206,7 @@ def _of_rendering(settings, scene, envmap, picture, mask, how=""):
     chosen, shape = settings.target, (scene.height, scene.width)
     if picture is not None:
         everywhere = np.ones(shape) if mask is None else mask
-        found = painted_image.given(picture, shape, np.zeros((*shape, 3)), everywhere)
+        image = painted_image.given(picture, shape, np.zeros((*shape, 3)), everywhere)
         source = "a picture of the scene, given as an array"
         asked = (picture, *([] if mask is None else [mask]))
     else:
@@ -218,21 +218,21 @@ def _of_rendering(settings, scene, envmap, picture, mask, how=""):
             file, mask = by_view[k]
             return painted_image.read(file, before.shape[:2], chosen.tonemap, None, mask, unnamed)
 
-        found = _of_views(scene, np.zeros((*shape, 3), np.float32), by_view, of_view)
+        image = _of_views(scene, np.zeros((*shape, 3), np.float32), by_view, of_view)
         source = f"a picture of the scene: {', '.join(chosen.files)}"
         asked = tuple(np.fromfile(file, np.uint8) for file in (*chosen.files, *chosen.masks) if file)
 
     # ---- Pixels that count, and its noise
-    weight = np.where(found.excluded[..., None], 0, found.coverage).astype(np.float32)
+    weight = np.where(image.excluded[..., None], 0, image.coverage).astype(np.float32)
     if not weight.any():
         raise InputError("target: no pixel of the picture counts: all are clipped, masked or transparent")
     counts = None if (weight == 1).all() else weight
-    picture = np.minimum(found.picture, np.float32(BRIGHTEST))
+    picture = np.minimum(image.picture, np.float32(BRIGHTEST))
     noise = rendered_anew.noise(picture, scene.rows)
     initial, spp, _ = with_noise(settings, scene, envmap)
     spp = rendered_anew.samples(picture, noise, initial, spp, scene.rows)
     source += f"{how}, as noisy as {spp} samples a pixel"
-    return Target(picture, counts, None, source, tuple(found.warnings), asked=asked, noise=noise, spp=spp)
+    return Target(picture, counts, None, source, tuple(image.warnings), asked=asked, noise=noise, spp=spp)
 
 
 def _of_photo(settings, scene, envmap, picture, mask):
@@ -245,20 +245,20 @@ def _of_photo(settings, scene, envmap, picture, mask):
     spp, cache = chosen.spp, settings.renderer.cache
     outlines, _, _ = rendered(scene, everywhere, spp, Seeds.of(settings.seed).target_again, cache)
     file = chosen.files[0]
-    found, warnings = photographs.read(file, "".join(chosen.masks), outlines, chosen.align)
+    photo, warnings = photographs.read(file, "".join(chosen.masks), outlines, chosen.align)
 
     # ---- Its camera
     initial, spp, _ = with_noise(settings, scene, envmap)
-    curves = found.curves if chosen.curve == "auto" or found.curves == ("linear",) else (chosen.curve,)
+    curves = photo.curves if chosen.curve == "auto" or photo.curves == ("linear",) else (chosen.curve,)
     known = [None if value == "auto" else value for value in (chosen.exposure, chosen.white_balance)]
-    found = replace(found, curves=curves, stops=known[0], kelvin=known[1])
-    found = found.under(curves[0], initial, found.counts)
+    photo = replace(photo, curves=curves, stops=known[0], kelvin=known[1])
+    photo = photo.under(curves[0], initial, photo.counts)
     asked = tuple(np.fromfile(one, np.uint8) for one in (*chosen.files, *chosen.masks) if one)
-    placed = f", {found.placed.summary}" if found.placed.summary else ""
+    placed = f", {photo.placed.summary}" if photo.placed.summary else ""
     source = f"a photograph of the scene: {file}{placed}"
-    counts = None if (found.counts == 1).all() else found.counts
-    target = Target(found.picture, counts, None, source, tuple(warnings), asked=asked, photo=found)
-    target = target.developed(found)
+    counts = None if (photo.counts == 1).all() else photo.counts
+    target = Target(photo.picture, counts, None, source, tuple(warnings), asked=asked, photo=photo)
+    target = target.developed(photo)
 
     # ---- Its noise
     noise = rendered_anew.noise(target.picture, scene.rows)
@@ -266,12 +266,12 @@ def _of_photo(settings, scene, envmap, picture, mask):
     return replace(target, noise=noise, spp=spp)
 
 
-def _by_view(scene, views, given):
-    """Return what was given for each view, by the view's number."""
+def _by_view(scene, views, values):
+    """Return the value for each view, by the view's number."""
     numbers = [scene.view(view, "target.view") for view in views]
     if len(set(numbers)) < len(numbers):
         raise ConfigError("target.view: got a view by index and by name, expected each once")
-    return dict(zip(numbers, given, strict=True))
+    return dict(zip(numbers, values, strict=True))
 
 
 def _painted_files(scene, initial, settings):
@@ -301,10 +301,10 @@ def _painted_strokes(scene, initial, chosen):
         warnings.extend(_renumbered(line, own) for line in made.warnings)
         return replace(made, excluded=np.zeros(before.shape[:2], bool), warnings=())
 
-    found = _of_views(scene, initial, numbers, of_view)
-    if not found.coverage.any():
+    painted = _of_views(scene, initial, numbers, of_view)
+    if not painted.coverage.any():
         raise InputError(f"target.strokes: {'; '.join(warnings) or 'none of them paints anything'}")
-    return replace(found, warnings=tuple(warnings))
+    return replace(painted, warnings=tuple(warnings))
 
 
 def _renumbered(line, own):
@@ -339,9 +339,9 @@ def _seen(target, hidden, curve):
     counted = white if hidden is None else white & ~hidden
     share = counted.sum() / (white.size if hidden is None else max((~hidden).sum(), 1))
     if share > MOST_WHITE and target.photo is None:
-        said = f"target: {100 * share:.3g} % of its pixels are white under the tonemap '{curve}', where "
-        said += "measures and pictures show no difference: lower scene.scale, or set another output.tonemap"
-        target = replace(target, warnings=(*target.warnings, said))
+        line = f"target: {100 * share:.3g} % of its pixels are white under the tonemap '{curve}', where "
+        line += "measures and pictures show no difference: lower scene.scale, or set another output.tonemap"
+        target = replace(target, warnings=(*target.warnings, line))
     if hidden is None or not hidden.any():
         return target
     weight = np.ones((*hidden.shape, 1), np.float32) if target.weight is None else target.weight
@@ -386,10 +386,12 @@ def with_noise(
     error (h, w) of display values, RMS over channels: where it is not known from passes, |d1 - d2| / sqrt(2),
     with d2 a second rendering with as many samples.
     """
-    asked, seeds, keep = settings.target.spp, Seeds.of(settings.seed), settings.renderer.cache
-    picture, spp, noise = rendered(scene, envmap, asked, seeds.target, keep)
+    seeds = Seeds.of(settings.seed)
+    samples = settings.target.spp
+    keep = settings.renderer.cache
+    picture, spp, noise = rendered(scene, envmap, samples, seeds.target, keep)
     if noise is None:
-        again, _, _ = rendered(scene, envmap, asked, seeds.target_again, keep)
+        again, _, _ = rendered(scene, envmap, samples, seeds.target_again, keep)
         off = np.float64(apply_tonemap(picture)) - apply_tonemap(again)
         noise = np.sqrt(np.square(off).mean(axis=2) / 2)
     return picture, spp, noise

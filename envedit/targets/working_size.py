@@ -30,9 +30,9 @@ MUCH = 1.8
 
 def most_pixels(settings: config.Config) -> int | None:
     """Return the most pixels that an edit is solved on; None: as many as there are."""
-    asked = settings.renderer.pixels
-    if isinstance(asked, int):
-        return asked
+    pixels = settings.renderer.pixels
+    if isinstance(pixels, int):
+        return pixels
     chosen = settings.representation
     smooth = isinstance(chosen.cycles, str) or chosen.cycles <= CYCLES
     return PIXELS if smooth and settings.newton else None
@@ -46,8 +46,8 @@ def smaller(settings: config.Config, scene: Scene) -> Scene:
     most, pixels = most_pixels(settings), scene.width * scene.height
     if most is None or pixels <= MUCH * most:
         return scene
-    found = scaled(scene, (most / pixels) ** 0.5)
-    return found if found is not None and found.width * found.height < pixels else scene
+    small = scaled(scene, (most / pixels) ** 0.5)
+    return small if small is not None and small.width * small.height < pixels else scene
 
 
 def scaled(scene: Scene, factor: float) -> Scene | None:

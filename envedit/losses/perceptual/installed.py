@@ -72,7 +72,7 @@ class Networks(NamedTuple):
     settings: config.Config  # with numbers in the place of "auto"
     dists: Dists | None  # where the loss has it, and there are weights
     lpips: Lpips | None  # where there are weights
-    note: str  # that DISTS is off for want of weights; "" where it is on, or not asked for
+    note: str  # that DISTS is off, as there are no weights; "" where it is on, or not asked for
 
 
 def load(settings: config.Config) -> Networks:

@@ -40,16 +40,10 @@ class Overview:
 
 
 def make(matrix: ColourMatrix, shape: tuple[int, int], grid: tuple[int, int], views: Views = ()) -> Overview:
-    """Sum up the entries of a transport.
+    """Sum up the entries of a transport, pixels by texels.
 
-    Parameters
-    ----------
-    matrix : sparse_matrix.ColourMatrix
-        T, pixels by texels.
-    shape, grid : (int, int)
-        Height and width of the picture and of the map.
-    views : sequence of slice
-        Rows of each view, where the picture is of several: no block is of two.
+    ``shape`` and ``grid`` are height and width of the picture and of the map, ``views`` the rows of each
+    view, where the picture is of several: no block is of two.
     """
     block_of, blocks = _blocks(shape, views)
     cell_of, cells = tiles(*grid, max(1, -(-grid[1] // CELLS)))

@@ -61,14 +61,8 @@ class Block:
 def blocks(scene: mi.Scene, grid: Grid, pixels: int, count: int, bounces: int, seed: int) -> Iterator[Block]:
     """Trace the paths of a picture; yields a :class:`Block` for every few pixels.
 
-    Parameters
-    ----------
-    scene, bounces, seed
-        As of :func:`.camera_paths.trace`.
-    grid : Grid
-        Texels that escaping rays are recorded by.
-    pixels, count : int
-        Pixels of the picture, and camera paths a pixel.
+    ``pixels`` are those of the picture, ``count`` the camera paths of each; escaping rays are recorded by the
+    texels of ``grid``. Other parameters are as of :func:`.camera_paths.trace`.
     """
     size = max(SLICE, LANES // count // SLICE * SLICE)
     for first in range(0, pixels, size):

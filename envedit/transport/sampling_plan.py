@@ -86,20 +86,9 @@ def choose(
     memory_gb: float,
     few: bool = False,
 ) -> SamplingPlan:
-    """Choose how T is sampled.
+    """Choose how T of a scene is sampled, for maps of ``shape`` (H, W).
 
-    Parameters
-    ----------
-    scene : Scene
-        Scene, camera and film.
-    shape : (int, int)
-        Rows and columns of the map.
-    light : (ndarray (H,), ndarray (n,))
-        Of :func:`white_sky`.
-    spp, max_depth, few
-        As of :meth:`.LightTransport.build`.
-    memory_gb : float
-        Memory allowed, GB.
+    ``light`` is of :func:`white_sky`; other parameters are those of :meth:`.LightTransport.build`.
 
     Raises
     ------

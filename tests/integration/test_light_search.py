@@ -155,13 +155,6 @@ def test_a_light_that_the_map_does_not_have_is_added(transport):
     np.testing.assert_allclose(extra, 10, rtol=0.3)
 
 
-@pytest.mark.slow
-def test_nothing_is_added_to_a_sky_that_is_right(transport):
-    found = Found(transport("mirror"), sky(), picture(transport("mirror"), sky()))
-    assert not found.lit
-    np.testing.assert_allclose(found.decoded, sky()[:ROWS], rtol=0.02)
-
-
 # ---- pictures that say little ----------------------------------------------------------------------------
 
 

@@ -596,15 +596,6 @@ def test_overview_is_the_picture_of_cells_averaged_over_blocks(wide, rng):
 
 
 @pytest.mark.slow
-def test_overview_does_not_depend_on_columns(wide):
-    before = wide.overview()
-    fresh = build(wide.scene, 80, 160, spp=16)
-    fresh.probe(np.array([20 * 160 + 40]))
-    assert fresh.overview().matrix.tobytes() == before.matrix.tobytes()
-    assert wide.overview() is before  # summed up once
-
-
-@pytest.mark.slow
 def test_overview_on_disk_has_the_same_bits(lamp_scene, tmp_path, monkeypatch):
     first = build(lamp_scene, spp=32, folder=tmp_path).overview()
     with monkeypatch.context() as patch:

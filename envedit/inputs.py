@@ -29,26 +29,14 @@ _ROUNDING = 1e-6  # of a texel's largest channel
 
 @dataclass(frozen=True)
 class Given:
-    """Arrays and objects that take the place of a configuration's files.
-
-    Attributes
-    ----------
-    scene : Scene, optional
-        The scene.
-    envmap : ndarray (H, 2 H, 3), optional
-        The map to edit, linear radiance in the units of a file: the scene's ``scale`` multiplies it.
-    target_map : ndarray (H, 2 H, 3), optional
-        The map under which the target is rendered; likewise.
-    picture : ndarray (h, w, 3), optional
-        A painted picture, linear radiance.
-    mask : ndarray (h, w), optional
-        Where it was painted, in [0, 1]; None: where it differs from the initial rendering.
-    """
+    """Arrays and objects that take the place of a configuration's files."""
 
     scene: Scene | None = None
+    # (H, 2 H, 3), the map to edit, linear radiance in the units of a file, which the ``scale`` multiplies
     envmap: np.ndarray | None = None
-    target_map: np.ndarray | None = None
-    picture: np.ndarray | None = None
+    target_map: np.ndarray | None = None  # (H, 2 H, 3), the map under which the target is rendered; likewise
+    picture: np.ndarray | None = None  # (h, w, 3), a painted picture, linear radiance
+    # (h, w), where it was painted, in [0, 1]; None: where it differs from the initial rendering
     mask: np.ndarray | None = None
 
 
@@ -58,47 +46,24 @@ class InputMap:
 
     Everything is computed with :attr:`radiance` = ``scale`` * ``stored``; what is written goes back through
     :meth:`as_stored`, so that it can stand in the scene in the place of the file.
-
-    Attributes
-    ----------
-    source : str
-        The file, "sunsky", or "scene" for its own light that is no file.
-    stored : ndarray (H, W, 3) float32
-        Linear values as in the file, at the width asked for.
-    scale : float
-        What the scene's emitter multiplies them by.
-    size : (int, int)
-        Width and height of the file.
-    warnings : list of str
-        What was repaired, or is odd.
-    chromaticities : tuple, optional
-        Colour space of the file (:mod:`.primaries`); None: Rec. 709.
-    placed : PlacedLights, optional
-        The map as the file has it, where lights of it were placed by hand; ``stored`` has them placed.
-    array : ndarray (H, W, 3), optional
-        The whole map, where it came as an array and not from a file.
-    unmoved : ndarray (H, W, 3), optional
-        The :attr:`radiance` as the file has it, where lights were placed or the map was turned by hand.
-    locked : ndarray (H, W, 3), optional
-        What of :attr:`radiance` is of lights that ``[[input.lights]]`` locks.
-    half : bool
-        Whether the file is OpenEXR in half.
-    unclipped : str
-        What was done about a clipped sun, a clause; "" where that was not asked for.
     """
 
-    source: str
-    stored: np.ndarray
-    scale: float
-    size: tuple[int, int]
-    warnings: list[str]
+    source: str  # the file, "sunsky", or "scene" for its own light that is no file
+    stored: np.ndarray  # (H, W, 3) float32, linear values as in the file, at the width asked for
+    scale: float  # what the scene's emitter multiplies them by
+    size: tuple[int, int]  # width and height of the file
+    warnings: list[str]  # what was repaired, or is odd
+    # Colour space of the file (:mod:`.primaries`); None: Rec. 709
     chromaticities: Chromaticities | None = None
+    # The map as the file has it, where lights of it were placed by hand; ``stored`` has them placed
     placed: PlacedLights | None = None
-    array: np.ndarray | None = None
+    array: np.ndarray | None = None  # (H, W, 3), the whole map, where it came as an array and not from a file
+    # (H, W, 3), the :attr:`radiance` of the file, where lights were placed or the map was turned by hand
     unmoved: np.ndarray | None = None
+    # (H, W, 3), what of :attr:`radiance` is of lights that ``[[input.lights]]`` locks
     locked: np.ndarray | None = None
-    half: bool = False
-    unclipped: str = ""
+    half: bool = False  # whether the file is OpenEXR in half
+    unclipped: str = ""  # what was done about a clipped sun, a clause; "" where that was not asked for
 
     @functools.cached_property
     def radiance(self) -> np.ndarray:
@@ -211,18 +176,10 @@ def read_map(
     width: int | None = None,
     array: np.ndarray | None = None,
 ) -> InputMap:
-    """Read the map of a configuration.
+    """Read the map of a configuration, or take it from an ``array`` (H, 2 H, 3).
 
-    Parameters
-    ----------
-    settings : config.Input
-        Which map.
-    scene : Scene, optional
-        Whose own light and scale; None: none, and 1.
-    width : int, optional
-        Texels across; None: as many as the file has (of a map that is made: the working width).
-    array : ndarray (H, 2 H, 3), optional
-        The map itself, in place of the one that the configuration names.
+    ``scene`` is what its own light and scale are taken from; without one the scale is 1. The map has
+    ``width`` texels across, by default as many as its file (one that is made: the working width).
 
     Raises
     ------
@@ -271,16 +228,8 @@ def _by_hand(settings, input_map):
 def read_file(source: str | np.ndarray, width: int | None, settings: config.Input, scale: float) -> InputMap:
     """Read a map from its file, or take it from an array (H, 2 H, 3).
 
-    Parameters
-    ----------
-    source : str or ndarray
-        The file or the array.
-    width : int, optional
-        Texels across; None: as many as the file has.
-    settings : config.Input
-        ``repair``, ``unclip`` and ``colour_space`` count.
-    scale : float
-        What the scene multiplies it by.
+    It has ``width`` texels across, by default as many as the file; ``scale`` is what the scene multiplies it
+    by. Of the settings ``repair``, ``unclip`` and ``colour_space`` count.
 
     Raises
     ------
@@ -323,26 +272,9 @@ def _unclipped(input_map, width):
 
 
 def load_map(settings: config.Input, scene: Scene | None = None) -> tuple[np.ndarray, list[str]]:
-    """Load the map of a configuration at working width.
+    """Load the map of a configuration at working width: radiance (H, W, 3) in the scene, and warnings.
 
-    Parameters
-    ----------
-    settings : config.Input
-        Which map.
-    scene : Scene, optional
-        The scene whose own map and scale count.
-
-    Returns
-    -------
-    envmap : ndarray (H, W, 3) float32
-        Linear radiance that reaches the scene.
-    warnings : list of str
-        What was repaired, or is odd.
-
-    Raises
-    ------
-    ConfigError, InputError
-        As of :func:`read_map` and :class:`InputMap`.
+    Errors are those of :func:`read_map` and :attr:`InputMap.radiance`.
     """
     input_map = read_map(settings, scene, settings.width)
     return input_map.radiance, input_map.warnings

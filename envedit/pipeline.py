@@ -23,7 +23,7 @@ from envedit.core.seeds import Seeds
 from envedit.export import adjustments, light_list
 from envedit.export.file_resolution import Found
 from envedit.losses import metrics, naturalness
-from envedit.losses.perceptual import backbones, distances, installed
+from envedit.losses.perceptual import installed
 from envedit.maps import map_lights
 from envedit.preparation import Preparation
 from envedit.report import variants
@@ -152,7 +152,10 @@ class _Edit:
     def __init__(self, settings, folder, base, watch, memory):
         self.begun = time.perf_counter()
         self.clock = _Clock()
-        self.settings = installed.settled(settings)
+        networks = installed.load(settings)
+        self.settings = networks.settings
+        self.dists = networks.dists
+        self.lpips = networks.lpips
         self.folder = folder
         self.base = base
         self.watch = watch
@@ -162,12 +165,10 @@ class _Edit:
         self.warnings: list[str] = []
         self.others: list[variants.Variant] = []
         self.state = adam_loop.State()
-        self.dists, self.lpips = _perceptual(self.settings)
-        missing = installed.missing(settings)
-        if self.settings.loss.dists and self.dists is None:
-            self.warnings.append(f"{missing}, or set loss.dists to 0")
-        elif missing and not self.settings.loss.dists:
-            self.notes.append(missing)
+        if networks.note and self.settings.loss.dists:
+            self.warnings.append(f"{networks.note}, or set loss.dists to 0")
+        elif networks.note:
+            self.notes.append(networks.note)
 
     def load(self):
         """Load the scene and the map, and make the target; ``small`` is the scene at the size to solve at."""
@@ -598,15 +599,3 @@ class _Edit:
             memory=self.memory,
             base=self.base,
         )
-
-
-def _perceptual(settings):
-    """Load DISTS, where the loss has it, and LPIPS; None where there are no weights."""
-    files = installed.files(settings)
-    dists = None
-    lpips = None
-    if "vgg" in files:
-        dists = distances.Dists(backbones.Backbone.load("vgg", files["vgg"]), files["dists"])
-    if "backbone" in files:
-        lpips = distances.Lpips(settings.perceptual.network, files["backbone"], files["heads"])
-    return dists, lpips

@@ -45,66 +45,30 @@ as many as the target's."""
 
 @dataclass(frozen=True)
 class Edit:
-    """An edit that is ready to be optimised.
+    """An edit that is ready to be optimised."""
 
-    Attributes
-    ----------
-    job : Job
-        With the map, turned, as its original.
-    params : dict
-        Where it starts.
-    crop : ndarray (rows, W, 3)
-        Active rows of that map.
-    degrees : float
-        By how much it has been turned.
-    frozen : ndarray of bool (H, W) or None
-        Active texels that keep their value; None where the renderer does not know.
-    notes : list of str
-        What was chosen.
-    """
-
-    job: Job
-    params: dict
-    crop: np.ndarray
-    degrees: float
+    job: Job  # has the map, turned, as its original
+    params: dict  # where it starts
+    crop: np.ndarray  # (rows, W, 3), active rows of that map
+    degrees: float  # by how much it has been turned
+    # bool (H, W), active texels that keep their value; None where the renderer does not know
     frozen: np.ndarray | None
-    notes: list[str]
+    notes: list[str]  # what was chosen
 
 
 @dataclass
 class Preparation:
-    """What edits of one configuration have in common.
+    """What edits of one configuration have in common."""
 
-    Attributes
-    ----------
-    settings : config.Config
-        What is to be done.
-    scene : Scene
-        What is lit.
-    original : ndarray (H, W, 3)
-        The map.
-    rows : Rows
-        Its active rows.
-    folder : Path, optional
-        Of the checkpoint.
-    watch : Watch
-        Receives progress.
-    dists : distances.Dists, optional
-        As for :class:`.edit_state.EditState`.
-    clock : callable
-        ``with clock(name):`` adds up seconds.
-    locked : ndarray (H, W, 3), optional
-        Radiance of lights that layers leave as they are; the sky is then not turned.
-    """
-
-    settings: config.Config
-    scene: Scene
-    original: np.ndarray
-    rows: Rows
-    folder: Path | None
-    watch: Watch
-    dists: distances.Dists | None
-    clock: Callable[[str], AbstractContextManager]
+    settings: config.Config  # what is to be done
+    scene: Scene  # what is lit
+    original: np.ndarray  # (H, W, 3), the map
+    rows: Rows  # its active rows
+    folder: Path | None  # of the checkpoint
+    watch: Watch  # receives progress
+    dists: distances.Dists | None  # as for :class:`.edit_state.EditState`
+    clock: Callable[[str], AbstractContextManager]  # ``with clock(name):`` adds up seconds
+    # (H, W, 3), radiance of lights that layers leave as they are; the sky is then not turned
     locked: np.ndarray | None = None
     renderer: renderers.Renderer | None = None
     _recordings: initialization.Recordings | None = None

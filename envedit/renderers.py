@@ -40,18 +40,9 @@ class Renderer(Protocol):
 def make(
     settings: config.Config, scene: Scene, shape: tuple[int, int], progress: Progress | None = None
 ) -> Renderer:
-    """Build the renderer of a configuration for maps of the given (H, W).
+    """Build the renderer of a configuration for maps of ``shape`` (H, W).
 
-    Parameters
-    ----------
-    settings : config.Config
-        Whose renderer.
-    scene : Scene
-        The scene.
-    shape : (int, int)
-        Rows and columns of the maps.
-    progress : callable, optional
-        Receives the blocks of pixels done, and all.
+    ``progress`` receives the blocks of pixels done, and all.
     """
     chosen = settings.renderer
     if chosen.kind == "path":

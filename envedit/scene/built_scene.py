@@ -53,13 +53,9 @@ def load(
 ) -> Scene:
     """Take a scene in any form.
 
-    Parameters
-    ----------
-    scene : path, str, dict, mitsuba.Scene or Scene
-        A file, the name of a shipped scene, a dict as ``mi.load_dict`` takes it, or a built scene, for which
-        all but ``sensors`` and ``scale`` is fixed.
-    width, height, parameters, base, sensors, up, scale
-        As of :func:`.scene.load`.
+    ``scene`` is a file, the name of a shipped scene, a dict as ``mi.load_dict`` takes it, a Scene, or a built
+    ``mitsuba.Scene``, for which all but ``sensors`` and ``scale`` is fixed. Other parameters are those of
+    :func:`.scene.load`.
 
     Raises
     ------

@@ -56,6 +56,10 @@ class Escape:
     active: mi.Bool
 
 
+class NoPlaceError(ValueError):
+    """No light makes what is asked for at a place of a picture; the text says why."""
+
+
 def lattice(index: mi.UInt32, scramble: mi.UInt32) -> mi.Point2f:
     """Return point ``index`` of the R2 sequence, shifted by a hash of ``scramble``; in [0, 1)^2."""
     shift = mi.sample_tea_32(scramble, mi.UInt32(0x9E3779B9))

@@ -8,30 +8,20 @@ Mitsuba's own loop.
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 
-def render(
-    scene: mi.Scene, integrator: mi.Integrator, spp: int, seed: int, medium: mi.Medium = None, view: int = 0
-) -> np.ndarray:
+def render(scene: mi.Scene, integrator: mi.Integrator, spp: int, seed: int, view: int = 0) -> np.ndarray:
     """Render one sensor of a scene as ``mi.render`` does, with sums in a fixed order.
 
-    Parameters
-    ----------
-    scene : mi.Scene
-        Whose sensor; its film gives size, crop and filter.
-    integrator : mi.Integrator
-        A sampling integrator, such as ``path``.
-    spp : int
-        Samples a pixel; as many more as the sampler needs to fill its grid.
-    seed : int
-        Of the sampler.
-    medium : mi.Medium, optional
-        Around the camera; only volumetric integrators look at it.
-    view : int
-        Index of the sensor.
+    ``view`` is the sensor's index; its film gives size, crop and filter. ``integrator`` is a sampling one,
+    such as ``path``. There are ``spp`` samples a pixel, or as many more as the sampler needs to fill its
+    grid.
 
     Returns
     -------
@@ -58,7 +48,7 @@ def render(
     pixel = dr.arange(mi.UInt32, count) // spp
     corner = mi.Point2f(mi.Float(pixel % across), mi.Float(pixel // across)) - border
     inside = sampler.next_2d()
-    channels = _radiance(scene, sensor, integrator, sampler, corner + inside, spp, medium)
+    channels = _radiance(scene, sensor, integrator, sampler, corner + inside, spp)
     dr.eval(channels, inside)  # the sums below must not trace again
 
     # ---- Sums over the samples of each pixel, in a fixed order
@@ -110,7 +100,7 @@ def _filtered(pixel, rfilter, channels, x, y, width, across, down, border, reach
     return red, green, blue, alpha, total
 
 
-def _radiance(scene, sensor, integrator, sampler, position, spp, medium):
+def _radiance(scene, sensor, integrator, sampler, position, spp):
     """Trace one path a position, in pixels from the crop's corner; returns red, green, blue and alpha."""
     lens = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
     time = sensor.shutter_open()
@@ -120,5 +110,16 @@ def _radiance(scene, sensor, integrator, sampler, position, spp, medium):
         time, 0, position / mi.Vector2f(sensor.film().crop_size()), lens
     )
     ray.scale_differential(spp**-0.5)
-    radiance, valid, _ = integrator.sample(scene, sampler, ray, medium)
+    radiance, valid, _ = integrator.sample(scene, sampler, ray)
     return *mi.Color3f(mi.unpolarized_spectrum(weight * radiance)), dr.select(valid, mi.Float(1), 0)
+
+
+@contextlib.contextmanager
+def threads(count: int) -> Iterator[None]:
+    """Let Dr.Jit work with so many threads."""
+    before = dr.thread_count()
+    dr.set_thread_count(count)
+    try:
+        yield
+    finally:
+        dr.set_thread_count(before)

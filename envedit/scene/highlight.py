@@ -7,16 +7,13 @@ import mitsuba as mi
 import numpy as np
 
 from envedit.scene import camera_paths
+from envedit.scene.camera_paths import NoPlaceError
 from envedit.scene.scene import Scene
 
 PATHS = 256
 """Paths from one place: samples of the glossy lobes that are seen there."""
 BOUNCES = 8
 """Most surfaces on a path, such as mirrors that show a glossy surface."""
-
-
-class NoHighlightError(ValueError):
-    """No light of the map makes a highlight at a place; the text says why."""
 
 
 def direction(scene: Scene, view: int, x: float, y: float) -> np.ndarray:
@@ -43,7 +40,7 @@ def direction(scene: Scene, view: int, x: float, y: float) -> np.ndarray:
 
     Raises
     ------
-    NoHighlightError
+    NoPlaceError
         What is seen there is not glossy, or reflects mostly another object.
     """
     value, specular, bounces, leaves, toward = _followed(scene, view, x, y)
@@ -51,12 +48,12 @@ def direction(scene: Scene, view: int, x: float, y: float) -> np.ndarray:
     if not reflected.any():
         reflected = leaves  # the map itself is seen there
     if not reflected.any():
-        raise NoHighlightError("the surface is not glossy there: no light makes a highlight")
+        raise NoPlaceError("the surface is not glossy there: no light makes a highlight")
     if specular[reflected].any():
         reflected &= specular
     lobe = reflected & (value >= 0.5 * value[reflected].max())
     if 2 * np.count_nonzero(lobe & leaves) < np.count_nonzero(lobe):
-        raise NoHighlightError("another object is reflected there: no light makes a highlight")
+        raise NoPlaceError("another object is reflected there: no light makes a highlight")
     mean = scene.to_world.T @ toward[lobe & leaves].mean(axis=0)
     return mean / np.linalg.norm(mean)
 

@@ -23,24 +23,12 @@ _MOST_SAMPLES = 2**21  # at a time
 
 @dataclass(frozen=True, eq=False)
 class OwnLight:
-    """An environment emitter of a parsed scene.
+    """An environment emitter of a parsed scene."""
 
-    Attributes
-    ----------
-    plugin : str
-        Its kind, such as ``sunsky``.
-    texels : ndarray (H, W, 3) or None
-        What an ``envmap`` was given in place of a file.
-    state : mitsuba.parser.ParserState
-        A scene of this emitter alone, not built.
-    where : str
-        What errors call the scene.
-    """
-
-    plugin: str
-    texels: np.ndarray | None
-    state: mi.parser.ParserState
-    where: str
+    plugin: str  # its kind, such as ``sunsky``
+    texels: np.ndarray | None  # (H, W, 3), what an ``envmap`` was given in place of a file
+    state: mi.parser.ParserState  # a scene of this emitter alone, not built
+    where: str  # what errors call the scene
 
     @classmethod
     def of(cls, state: mi.parser.ParserState, index: int, where: str) -> OwnLight:
@@ -54,17 +42,8 @@ class OwnLight:
     def map(self, width: int, to_world: np.ndarray) -> np.ndarray:
         """Return the texels that the emitter was given, or average its radiance over those of a map.
 
-        Parameters
-        ----------
-        width : int
-            Texels across, of a map that is made; its height is half of it.
-        to_world : array (3, 3)
-            Rotation from the map's frame to the scene's.
-
-        Returns
-        -------
-        ndarray (H, W, 3) float32
-            Linear radiance.
+        A map that is made is ``width`` texels wide and half as high; ``to_world`` (3, 3) is the rotation from
+        its frame to the scene's. Returned is linear radiance (H, W, 3) float32.
 
         Raises
         ------

@@ -95,7 +95,7 @@ class PathTracer:
         data = mi.TensorXf(data)
         dr.enable_grad(data)
         self._set(data)
-        with dr.resume_grad(), _threads(1) if self.one_thread else contextlib.nullcontext():
+        with dr.resume_grad(), film.threads(1) if self.one_thread else contextlib.nullcontext():
             self._integrators[1].render_backward(
                 self.scene.mi, self.scene.params, picture, seed=seed, spp=self.spp
             )
@@ -129,17 +129,6 @@ class _Rendering(dr.CustomOp):
 
     def name(self):
         return "path tracing"
-
-
-@contextlib.contextmanager
-def _threads(count):
-    """Let Dr.Jit work with so many threads."""
-    before = dr.thread_count()
-    dr.set_thread_count(count)
-    try:
-        yield
-    finally:
-        dr.set_thread_count(before)
 
 
 def _whole(scene, spp):

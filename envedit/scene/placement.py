@@ -7,6 +7,7 @@ import mitsuba as mi
 import numpy as np
 
 from envedit.scene import shadow
+from envedit.scene.camera_paths import NoPlaceError
 from envedit.scene.scene import Scene
 
 RAYS = 2048
@@ -18,10 +19,6 @@ COVER_DEGREES = 8.0
 64 texels wide. Not measured; an object that is smaller is aimed at in its middle."""
 GRAZING_DEGREES = 10.0
 """Angle of a rim light above the tangent plane of the picked place; at 0 it would light what lies beyond."""
-
-
-class NoPlaceError(ValueError):
-    """No light can do that at a place; the text says why."""
 
 
 def illuminating(scene: Scene, view: int, x: float, y: float) -> np.ndarray:

@@ -20,19 +20,8 @@ def rendered(
 ) -> tuple[np.ndarray, int, np.ndarray | None]:
     """Render as :meth:`.Scene.sampled`, or take what an earlier call rendered from disk.
 
-    The judged rendering of a result is not taken from here: it is made with fresh samples every time.
-
-    Parameters
-    ----------
-    scene, envmap, spp, seed, exactly
-        As of :meth:`.Scene.sampled`.
-    keep : bool
-        Keep renderings on disk and take them from there.
-
-    Returns
-    -------
-    picture, spp, noise
-        As of :meth:`.Scene.sampled`.
+    Parameters and values are those of :meth:`.Scene.sampled`; ``keep``: renderings are kept on disk. The
+    judged rendering of a result is not taken from here: it is made with fresh samples every time.
     """
     # ---- What a rendering depends on
     cache = DiskCache(cache_folder("renderings") if keep else None, MOST_BYTES)

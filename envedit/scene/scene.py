@@ -131,7 +131,7 @@ class Scene:
         if not self.hide_emitters:
             return None
         self.set_envmap(np.zeros((4, 8, 3), np.float32))
-        picture = self._traced(min(_ALPHA_SPP, self._pass_samples()), 0, 0, 2)
+        picture = self._pass(min(_ALPHA_SPP, self._pass_samples()), 0, 0, 2)
         return np.clip(picture[..., 3], 0, 1).astype(np.float32)
 
     @property
@@ -225,7 +225,7 @@ class Scene:
         counts = [most] * (spp // most) + ([spp % most] if spp % most else [])
         total = np.zeros((self.height, self.width, 3))
         for i, count in enumerate(counts):
-            total += count / spp * self._pass(count, seed, i, max_depth)
+            total += count / spp * self._pass(count, seed, i, max_depth)[..., :3]
         return self._checked(total)
 
     def sampled(
@@ -262,7 +262,7 @@ class Scene:
         total: Any = 0.0  # then arrays
         shown, power = total, total
         for i in range(QUIET_MOST // count):
-            picture = self._pass(count, seed, i, self.max_depth)
+            picture = self._pass(count, seed, i, self.max_depth)[..., :3]
             display = tonemap(picture)
             total, shown, power = total + picture, shown + display, power + display**2
             n = i + 1
@@ -278,10 +278,6 @@ class Scene:
         return 4 ** (max(0, (_PASS_SAMPLES // (self.width * self.height)).bit_length() - 1) // 2)
 
     def _pass(self, count, seed, i, max_depth):
-        """Render one pass, (h, w, 3) float64."""
-        return self._traced(count, seed, i, max_depth)[..., :3]
-
-    def _traced(self, count, seed, i, max_depth):
         """Render one pass of every view with alpha, (h, w, 4) float64."""
         installed_plugins.come_first()
         options = {"max_depth": max_depth, "rr_depth": self.rr_depth, "hide_emitters": self.hide_emitters}
@@ -289,7 +285,7 @@ class Scene:
         pictures = []
         for k in range(len(self.views)):
             pass_seed = int(np.random.SeedSequence([seed, i, k]).generate_state(1)[0])
-            pictures.append(film.render(self.mi, integrator, count, pass_seed, view=k))
+            pictures.append(film.render(self.mi, integrator, count, pass_seed, k))
         return np.concatenate(pictures)
 
     def _checked(self, total):
@@ -302,19 +298,6 @@ class Scene:
                 f"the first at {place_of(bad)}; look for broken materials or too much light"
             )
         return result
-
-
-@contextlib.contextmanager
-def _two_threads():
-    """Lend Dr.Jit a second thread: on one, Mitsuba waits for ever for an EXR texture."""
-    threads = dr.thread_count()
-    if threads < 2:
-        dr.set_thread_count(2)
-    try:
-        yield
-    finally:
-        if threads < 2:
-            dr.set_thread_count(threads)
 
 
 def load(
@@ -419,7 +402,8 @@ def load(
             node.props.mark_queried(key, False)
 
     # ---- Build
-    with _two_threads(), quiet_libraries():  # libjpeg prints about odd textures
+    # On one thread Mitsuba waits for ever for an EXR texture; libjpeg prints about odd textures.
+    with film.threads(max(2, dr.thread_count())), quiet_libraries():
         built = parser.called(where, mi.parser.instantiate, config, state)
     scene = built[0] if isinstance(built, list | tuple) else built
     if scene.environment() is None or scene.environment().id() != name:

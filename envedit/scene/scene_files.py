@@ -111,16 +111,9 @@ def lines_of(
 ) -> list[Any]:
     """Return the lines of JSON that the ``main`` of a module writes in a process of its own.
 
-    Parameters
-    ----------
-    module : str
-        It writes a first line as soon as it has begun.
-    arguments : sequence
-        Of its ``main``, as JSON knows them.
-    seconds : float
-        Processor time that it allows itself.
-    environment : dict, optional
-        Variables of its environment beside those of this process.
+    It writes a first line as soon as it has begun. ``arguments`` are those of its ``main``, as JSON knows
+    them, ``seconds`` the processor time that it allows itself, and ``environment`` more variables of its
+    environment.
 
     Raises
     ------

@@ -46,24 +46,15 @@ _NAME = re.compile(r"\$\{?([A-Za-z_]\w*)")
 
 @dataclass
 class Outline:
-    """What the text of a scene contains, with all it includes.
+    """What the text of a scene contains, with all it includes."""
 
-    Attributes
-    ----------
-    used, defaults : set of str
-        Names after ``$``, and those with a ``<default>``.
-    folders : list of Path
-        Of ``<path value="...">``, in order.
-    files : list of str
-        What it includes, and the values of properties called ``filename``.
-    spectra : list of str
-        Files of ``<spectrum filename="...">``, which Mitsuba's parser reads.
-    """
-
+    # used, defaults: names after ``$``, and those with a ``<default>``
     used: set[str] = field(default_factory=set)
     defaults: set[str] = field(default_factory=set)
-    folders: list[Path] = field(default_factory=list)
+    folders: list[Path] = field(default_factory=list)  # of ``<path value="...">``, in order
+    # What it includes, and the values of properties called ``filename``
     files: list[str] = field(default_factory=list)
+    # Files of ``<spectrum filename="...">``, which Mitsuba's parser reads
     spectra: list[str] = field(default_factory=list)
 
 

@@ -7,6 +7,7 @@ import mitsuba as mi
 import numpy as np
 
 from envedit.scene import camera_paths
+from envedit.scene.camera_paths import NoPlaceError
 from envedit.scene.scene import Scene
 
 NEAR = np.array([(x, y) for y in (-1, 0, 1) for x in (-1, 0, 1)])
@@ -15,28 +16,15 @@ PASSED = 16
 """Most surfaces that a ray goes through without being scattered, such as the holes of a mask."""
 
 
-class NoShadowError(ValueError):
-    """No shadow is found at a place, or can be put there; the text says why."""
-
-
 def occluder(scene: Scene, view: int, x: float, y: float, toward: np.ndarray) -> np.ndarray:
-    """Return the point that keeps a light from a place of a view.
+    """Return the point that keeps a light from a place of a view, (3,) float64 in the scene's coordinates.
 
-    Parameters
-    ----------
-    scene, view, x, y
-        As of :func:`.highlight.direction`.
-    toward : ndarray (3,)
-        Direction of the light in the frame of the map.
-
-    Returns
-    -------
-    ndarray (3,) float64
-        The first point, in the scene's own coordinates, that a ray from there towards the light hits.
+    It is the first that a ray from there ``toward`` the light, a direction (3,) in the frame of the map,
+    hits. Other parameters are those of :func:`.highlight.direction`.
 
     Raises
     ------
-    NoShadowError
+    NoPlaceError
         No surface is seen there, it faces away from the light, or nothing is between both.
     """
     rows = scene.rows[view]
@@ -53,39 +41,30 @@ def occluder(scene: Scene, view: int, x: float, y: float, toward: np.ndarray) ->
     if blocked.any():
         return hit.p.numpy().T[int(np.argmax(blocked))].astype(np.float64)
     if not surfaces.is_valid().numpy()[0]:
-        raise NoShadowError("no surface is seen there")
+        raise NoPlaceError("no surface is seen there")
     if not facing.numpy()[0]:
-        raise NoShadowError("the surface faces away from the light there: pick a shadow that is cast")
-    raise NoShadowError("the place is in no shadow of the light")
+        raise NoPlaceError("the surface faces away from the light there: pick a shadow that is cast")
+    raise NoPlaceError("the place is in no shadow of the light")
 
 
 def direction(scene: Scene, view: int, x: float, y: float, point: np.ndarray) -> np.ndarray:
     """Return where a light must stand for the shadow of a point to lie at a place of a view.
 
-    Parameters
-    ----------
-    scene, view, x, y
-        As of :func:`occluder`.
-    point : ndarray (3,)
-        What :func:`occluder` returned.
-
-    Returns
-    -------
-    ndarray (3,) float64
-        Unit vector in the frame of the map.
+    ``point`` (3,) is what :func:`occluder` returned; other parameters and the return value are those of
+    :func:`.highlight.direction`.
 
     Raises
     ------
-    NoShadowError
+    NoPlaceError
         No surface is seen there, or it faces away from the point.
     """
     surface = surfaces_seen(scene, view, np.array([[x, y]]))
     if not surface.is_valid().numpy()[0]:
-        raise NoShadowError("no surface is seen there")
+        raise NoPlaceError("no surface is seen there")
     toward = np.float64(point) - surface.p.numpy()[:, 0]
     normal, eye = (v.numpy()[:, 0] for v in (surface.n, surface.to_world(surface.wi)))
     if (toward @ normal) * (eye @ normal) <= 0:
-        raise NoShadowError("the surface faces away from what casts the shadow")
+        raise NoPlaceError("the surface faces away from what casts the shadow")
     light = scene.to_world.T @ toward
     return light / np.linalg.norm(light)
 

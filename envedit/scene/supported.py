@@ -41,30 +41,16 @@ _ROUNDING = 1e-3  # of a rotation's columns that a file gives with few digits
 
 @dataclass(frozen=True)
 class OwnMap:
-    """The light that a scene's environment emitter gives.
+    """The light that a scene's environment emitter gives."""
 
-    Attributes
-    ----------
-    file : Path or None
-        The map's file, which need not exist; None where the emitter is no ``envmap`` or names none.
-    scale : float
-        What any map is multiplied by, above 0.
-    notes : tuple of str
-        What the user should know.
-    light : OwnLight or None
-        The emitter, where it names no file.
-    missing : str
-        Why the scene has neither, as an error says it; "" of a scene that is made for any map.
-    added : bool
-        The scene has no environment emitter: the map is light beside its own.
-    """
-
+    # The map's file, which need not exist; None where the emitter is no ``envmap`` or names none
     file: Path | None
-    scale: float
-    notes: tuple[str, ...] = ()
-    light: OwnLight | None = None
+    scale: float  # what any map is multiplied by, above 0
+    notes: tuple[str, ...] = ()  # what the user should know
+    light: OwnLight | None = None  # the emitter, where it names no file
+    # Why the scene has neither, as an error says it; "" of a scene that is made for any map
     missing: str = ""
-    added: bool = False
+    added: bool = False  # the scene has no environment emitter: the map is light beside its own
 
 
 PLACEHOLDER = "placeholder"

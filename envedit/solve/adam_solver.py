@@ -23,18 +23,10 @@ quickstart, four representations at rates of 0.1 to 1e38: it is 0.02 to 1.7, or 
 def optimise(
     edit: EditState, params: Params, crop: np.ndarray, resume: bool
 ) -> tuple[Params, adam_loop.State]:
-    """Optimise from the start, or from the checkpoint.
+    """Optimise from the start, or from the checkpoint where there is one and ``resume`` asks for it.
 
-    Parameters
-    ----------
-    edit : EditState
-        What is edited; a resumed run takes its target's picture from the checkpoint.
-    params : dict
-        Where to start.
-    crop : ndarray (rows, W, 3)
-        The active rows of the original.
-    resume : bool
-        Go on from the checkpoint, where there is one.
+    ``params`` is where to start, ``crop`` (rows, W, 3) the active rows of the original. A resumed run takes
+    its target's picture from the checkpoint.
 
     Raises
     ------

@@ -51,11 +51,6 @@ class BlockJacobian:
         self._matrix = [np.ascontiguousarray(m[:, used]) for m in overview.matrix]
         self._tensors = [tensor(m) for m in self._matrix]
 
-    @property
-    def nbytes(self) -> int:
-        """Bytes that a Jacobian of all three channels reads."""
-        return sum(m.nbytes for m in self._matrix) + 3 * self._hats.nbytes
-
     def jacobian(self, slopes: np.ndarray) -> list[np.ndarray]:
         """Return the change of a block's radiance by each node, (blocks, n), per channel."""
         channels = []

@@ -27,42 +27,20 @@ SIZE_STEP = 0.1
 
 @dataclass(frozen=True)
 class Linearisation:
-    """Derivatives of a rendering.
+    """Derivatives of a rendering."""
 
-    Attributes
-    ----------
-    pictures : ndarray (k, h, w, 3)
-        By the unknowns of lights, by a camera's factors, and by the saturation.
-    named : list of (str, int, int or ndarray)
-        Which these are: name, light, and channel or axis.
-    profile : ndarray (h, w, 3)
-        Of the sky's light within blocks.
-    jacobian : list of ndarray (blocks, nodes)
-        By the log gain, per channel.
-    """
-
+    # (k, h, w, 3), by the unknowns of lights, by a camera's factors, and by the saturation
     pictures: np.ndarray
-    named: list
-    profile: np.ndarray
-    jacobian: list[np.ndarray]
+    named: list  # (str, int, int or ndarray), which these are: name, light, and channel or axis
+    profile: np.ndarray  # (h, w, 3), of the sky's light within blocks
+    jacobian: list[np.ndarray]  # (blocks, nodes), by the log gain, per channel
 
 
 class Derivatives:
     """Derivatives of the renderings of some unknowns; those of the last point are kept.
 
-    Parameters
-    ----------
-    unknowns : Unknowns
-        Of the layers.
-    transport : LightTransport
-        T; gets columns, with the fewest paths, for texels that a light covers.
-    blocks : BlockJacobian
-        T of blocks of pixels.
-
-    Attributes
-    ----------
-    angle : float
-        Rotation of the finite difference by a light's direction.
+    ``transport`` gets columns, with the fewest paths, for texels that a light covers; ``blocks`` is T of
+    blocks of pixels. ``angle`` is the rotation of the finite difference by a light's direction, radians.
     """
 
     def __init__(self, unknowns: Unknowns, transport: LightTransport, blocks: BlockJacobian):

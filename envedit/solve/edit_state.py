@@ -60,43 +60,21 @@ class Watch:
 
 @dataclass
 class EditState:
-    """One edit in progress.
+    """One edit in progress."""
 
-    Attributes
-    ----------
-    settings : config.Config
-        What is carried out.
-    scene : Scene
-        What is lit.
-    original : ndarray (H, W, 3)
-        The map.
-    first : int
-        Its first active row.
-    free : ndarray of bool (rows, W), optional
-        Active texels that may change; None: all.
-    target : Target
-        What the renderer is to make; solvers may change its weights and what it is compared with.
-    representation, renderer : Representation, Renderer
-        As :func:`.adam_loop.optimise` takes them; of layers, more than the protocol is used.
-    folder : Path, optional
-        Of the checkpoint.
-    watch : Watch
-        Receives progress.
-    dists : distances.Dists, optional
-        As for :class:`.adam_loop.Objective`.
-    """
-
-    settings: config.Config
-    scene: Scene
-    original: np.ndarray
-    first: int
-    free: np.ndarray | None
+    settings: config.Config  # what is carried out
+    scene: Scene  # what is lit
+    original: np.ndarray  # (H, W, 3), the map
+    first: int  # its first active row
+    free: np.ndarray | None  # bool (rows, W), active texels that may change; None: all
+    # What the renderer is to make; solvers may change its weights and what it is compared with
     target: Target
+    # representation, renderer: as for :func:`.adam_loop.optimise`; of layers more than the protocol is used
     representation: Any
     renderer: Renderer
-    folder: Path | None
-    watch: Watch
-    dists: distances.Dists | None = None
+    folder: Path | None  # of the checkpoint
+    watch: Watch  # receives progress
+    dists: distances.Dists | None = None  # as for :class:`.adam_loop.Objective`
     _blocks: dict = field(default_factory=dict, repr=False)
 
     @property

@@ -29,7 +29,6 @@ import numpy as np
 
 from envedit.core.arrays import tensor
 from envedit.core.color import tonemap
-from envedit.core.errors import InputError, place_of
 from envedit.core.rows import Rows
 from envedit.core.seeds import SIGNS
 from envedit.solve.likelihood import STATEMENTS, Likelihood, on_average_one
@@ -54,32 +53,19 @@ FULL_COLOUR_DIFFERENCE = 0.25
 
 @dataclass(frozen=True)
 class Reach:
-    """What is within reach.
+    """What is within reach."""
 
-    Attributes
-    ----------
-    share : float
-        1 - mean |closest - target| / mean |initial - target| over the painted pixels, by coverage, on
-        display values clip(x, 0, 1)^(1/2.2); from 0 to 1, and 1 if nothing is asked.
-    picture : ndarray (h, w, 3) float32
-        The closest picture, linear radiance.
-    residual : ndarray (h, w, 3) float32
-        Display values of the target less those of the closest picture: positive where no light is bright
-        enough without brightening what must stay, negative where none is dark enough.
-    envmap : ndarray (H, W, 3) float32
-        A map that renders to the picture; it answers this question only and does not look like a sky.
-    too_dark : float
-        Share of the residual in the painted region that is positive.
-    all_painted : bool
-        No pixel is held.
-    """
-
+    # 1 - mean |closest - target| / mean |initial - target| over the painted pixels, by coverage, on display
+    # values clip(x, 0, 1)^(1/2.2); from 0 to 1, and 1 if nothing is asked
     share: float
-    picture: np.ndarray
+    picture: np.ndarray  # (h, w, 3) float32, the closest picture, linear radiance
+    # (h, w, 3) float32, display values of the target less those of the closest picture: positive where no
+    # light is bright enough without brightening what must stay, negative where none is dark enough
     residual: np.ndarray
+    # (H, W, 3) float32, a map that renders to the picture; it does not look like a sky
     envmap: np.ndarray
-    too_dark: float = 0.0
-    all_painted: bool = False
+    too_dark: float = 0.0  # share of the residual in the painted region that is positive
+    all_painted: bool = False  # no pixel is held
 
     @property
     def note(self) -> str:
@@ -122,7 +108,6 @@ def reachable(
     target: np.ndarray,
     likelihood: Likelihood | None = None,
     rows: Rows | None = None,
-    free: np.ndarray | None = None,
     painted: np.ndarray | None = None,
     rendered: np.ndarray | None = None,
     known: np.ndarray | None = None,
@@ -141,8 +126,6 @@ def reachable(
         How much each pixel counts, and the mean of what was not painted; by default all count the same.
     rows : Rows, optional
         Active rows; the light of the others stays. All by default.
-    free : ndarray of bool (rows, W), optional
-        Texels of the active rows that may change; all by default.
     painted : ndarray (h, w), optional
         Coverage of the region that the request is about, 0 to 1; where None, all pixels that count.
     rendered : ndarray (h, w, 3), optional
@@ -154,13 +137,6 @@ def reachable(
     -------
     Reach
 
-    Raises
-    ------
-    InputError
-        A pixel of the target is not finite.
-    ValueError
-        Shapes do not match, or nothing is painted or counts.
-
     Notes
     -----
     A target that was rendered has noise of its own, which is out of reach: under a map that is known to make
@@ -168,9 +144,8 @@ def reachable(
     """
     # ---- The request
     original = np.ascontiguousarray(original, np.float32)
-    height, width, _ = original.shape
-    active = np.zeros((height, width), bool)
-    active[slice(None) if rows is None else rows.slice] = True if free is None else free
+    active = np.zeros(original.shape[:2], bool)
+    active[slice(None) if rows is None else rows.slice] = True
     request = _Request.of(transport, original, target, likelihood, painted, rendered)
     distance = request.distance(request.initial)
     if distance < 1e-6:  # float32
@@ -209,20 +184,14 @@ class _Request:
 
     @classmethod
     def of(cls, transport, original, target, likelihood, painted, rendered):
-        shape = transport.shape
-        target = _shaped("target", target, (*shape, 3))
-        if (bad := ~np.isfinite(target)).any():
-            raise InputError(f"target: pixel at {place_of(bad)} is not finite: repair it before painting")
-        likelihood = likelihood or Likelihood(on_average_one(None, shape))
-        counts = (_shaped("weight", likelihood.weight, (*shape, 1))[..., 0] > 0).astype(np.float64)
-        painted = counts if painted is None else _shaped("painted", painted, shape)
-        if not (painted.sum() > 0 and counts.sum() > 0):
-            raise ValueError("reachable: no pixel is painted or counts")
+        target = target.astype(np.float64)
+        likelihood = likelihood or Likelihood(on_average_one(None, transport.shape))
+        painted = likelihood.weight[..., 0] > 0 if painted is None else painted
         transport.resolve(original)
         initial = _rendering(transport, original)
         if rendered is not None:
-            target = target + initial - _shaped("rendered", rendered, (*shape, 3))
-        return cls(initial, np.maximum(target, 0), likelihood, painted)
+            target = target + initial - rendered
+        return cls(initial, np.maximum(target, 0), likelihood, painted.astype(np.float64))
 
     def distance(self, picture):
         """Mean absolute difference of display values in the painted region."""
@@ -252,13 +221,6 @@ class _Request:
         sigma = self.likelihood.paint_noise or 0.0
         scale = sigma * np.sqrt(STATEMENTS * self.likelihood.area / beyond)
         return scale * self.likelihood.share * self.slope(picture)
-
-
-def _shaped(name, values, shape):
-    values = np.asarray(values, np.float64)
-    if values.shape != shape:
-        raise ValueError(f"reachable: {name} must have shape {shape}, got {values.shape}")
-    return values
 
 
 def _rendering(transport, envmap):

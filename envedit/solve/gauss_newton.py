@@ -32,40 +32,24 @@ the start's squared error that the solution's must be below."""
 
 @dataclass
 class Run:
-    """State of a solution between two steps: all that is needed to continue.
+    """State of a solution between two steps: all that is needed to continue."""
 
-    Attributes
-    ----------
-    state, start : dict of str to ndarray
-        Unknowns now, and the centre of the prior of lights: ``gain`` (nodes, 3), ``turn``, ``flux``
-        (lights, 3) and ``size`` (lights, 1), logarithms and radians.
-    damping, scale : float
-        Of the next step; the threshold s.
-    finished : bool
-        No further step is made.
-    history : list of dict
-        A row a step: ``loss`` F, its parts ``data`` and ``prior``, the ``sigma`` at which they were
-        taken, ``residual`` RMS of display values, ``damping``, ``step_ms``.
-    most : int
-        Steps after which it ends.
-    hold : float
-        Weight of what was not painted, where it is raised (:mod:`.hold`).
-    corrected : bool
-        The last steps, towards a target without T's error (:mod:`.transport_error`).
-    wide : bool
-        Derivatives by a light's direction are wide differences: with narrow ones no step leads further.
-    """
-
+    # state, start: unknowns now, and the centre of the prior of lights: ``gain`` (nodes, 3), ``turn``,
+    # ``flux`` (lights, 3) and ``size`` (lights, 1), logarithms and radians
     state: dict
     start: dict
+    # damping, scale: of the next step; the threshold s
     damping: float = 1e-3
     scale: float = np.inf
-    finished: bool = False
+    finished: bool = False  # no further step is made
+    # A row a step: ``loss`` F, its parts ``data`` and ``prior``, the ``sigma`` at which they were taken,
+    # ``residual`` RMS of display values, ``damping``, ``step_ms``
     history: list[dict] = field(default_factory=list)
-    most: int = MOST_STEPS
-    hold: float = 1.0
+    most: int = MOST_STEPS  # steps after which it ends
+    hold: float = 1.0  # weight of what was not painted, where it is raised (:mod:`.hold`)
+    # Derivatives by a light's direction are wide differences: with narrow ones no step leads further
     wide: bool = False
-    corrected: bool = False
+    corrected: bool = False  # the last steps, towards a target without T's error (:mod:`.transport_error`)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return all but the history as arrays, for a checkpoint."""
@@ -88,28 +72,15 @@ class Run:
 
 @dataclass
 class Solution:
-    """What :func:`solve` found.
+    """What :func:`solve` found."""
 
-    Attributes
-    ----------
-    params : dict
-        Of the layers.
-    history : list of dict
-        A row a step: ``loss`` F, its parts ``data`` and ``prior``, the ``sigma`` at which they were
-        taken, ``residual`` RMS of display values, ``damping``, ``step_ms``.
-    run : Run
-        As it ended.
-    posterior : Posterior
-        How well the picture determines the sky.
-    note : str
-        What a user should know.
-    """
-
-    params: dict
+    params: dict  # of the layers
+    # A row a step: ``loss`` F, its parts ``data`` and ``prior``, the ``sigma`` at which they were taken,
+    # ``residual`` RMS of display values, ``damping``, ``step_ms``
     history: list[dict]
-    run: Run
-    posterior: Posterior
-    note: str = ""
+    run: Run  # as it ended
+    posterior: Posterior  # how well the picture determines the sky
+    note: str = ""  # what a user should know
 
 
 def solve(
@@ -165,8 +136,8 @@ def solve(
         before = replace(run, state=start, start=start)
         first = problem.evaluate(start, resolve=False)
         loss = _unlikeliness(problem, run, point, sigma) + 2 * normal.determined
-        noise = problem.noise(point.residual, sigma)
-        near = problem.noise(first.residual, sigma) < COMPARED_NOISE_RATIO * noise
+        noise = problem.likelihood.noise(point.residual, sigma)
+        near = problem.likelihood.noise(first.residual, sigma) < COMPARED_NOISE_RATIO * noise
         if _unlikeliness(problem, before, first, sigma) <= loss:
             note = "kept the initialisation: the better match of the rendering does not justify "
             note += f"{normal.determined:.0f} parameters (Akaike criterion)"
@@ -180,27 +151,20 @@ def solve(
 
 
 def descended(problem: Problem, run: Run, point: Point, sigma: float = SIGMA, steps: int = 1) -> Point:
-    """Make a few steps from where a run is; the run goes along.
+    """Make at most some ``steps`` from where a run is, at ``point``, and return where they end.
 
-    Parameters
-    ----------
-    problem, run, sigma
-        As of :func:`solve`.
-    point : Point
-        Of the run's state.
-    steps : int
-        Most steps; the run may be finished before.
+    The run goes along; it may be finished before. Other parameters are those of :func:`solve`.
     """
     return _descended(problem, run, point, sigma, len(run.history) + steps, None)
 
 
 def _normal(problem, run, point, sigma):
-    return problem.normal(point, run.start, problem.noise(point.residual, sigma), descent=False)
+    return problem.normal(point, run.start, problem.likelihood.noise(point.residual, sigma), descent=False)
 
 
 def _unlikeliness(problem, run, point, sigma):
     """Return -2 log posterior at the noise that the residual shows, but for a constant."""
-    noise = problem.noise(point.residual, sigma)
+    noise = problem.likelihood.noise(point.residual, sigma)
     return problem.loss(point, run.start, noise) + 6 * problem.likelihood.independent * float(np.log(noise))
 
 
@@ -210,7 +174,7 @@ def _descended(problem, run, point, sigma, most, after_step):
         began = time.perf_counter()
 
         # ---- Huber's threshold: the noise, at most halved at once
-        noise = problem.noise(point.residual, sigma)
+        noise = problem.likelihood.noise(point.residual, sigma)
         halved = run.scale / 2 if np.isfinite(run.scale) else 0
         run.scale = min(run.scale, max(noise, halved))
 
@@ -225,7 +189,7 @@ def _descended(problem, run, point, sigma, most, after_step):
 
         # ---- Whether it is the last one
         little = better is None or before - loss < LEAST_DECREASE * before
-        ended = little and run.scale <= 1.01 * problem.noise(point.residual, sigma)
+        ended = little and run.scale <= 1.01 * problem.likelihood.noise(point.residual, sigma)
         run.finished = ended and (run.wide or not problem.shining(run.state))
         if ended and not run.wide:  # other derivatives: what damping those needed says nothing of them
             run.wide, run.damping = True, Run.damping
@@ -276,7 +240,7 @@ def _lower(problem, run, point, normal):
         state = problem.step(run.state, normal, run.damping)
         there = None if state is None else problem.evaluate(state)
         if there is not None and there.residual is not None:
-            misfit = problem.misfit(there.residual, run.scale)
+            misfit = problem.likelihood.misfit(there.residual, run.scale)
             trial = _Trial(there, misfit, problem.penalty(there.state, run.start))
             if trial.loss >= before:
                 again = problem.evaluate(run.state, resolve=False)

@@ -20,27 +20,13 @@ LEAST_RAISE, LARGEST_RAISE, LARGEST_HOLD = 1.5, 16.0, 256.0
 def change(rendering: np.ndarray, aim: np.ndarray, coverage: np.ndarray, counts: np.ndarray) -> float:
     """Return the mean |change| of display values where nothing was painted; 0 if all was.
 
-    Parameters
-    ----------
-    rendering, aim : ndarray (h, w, 3)
-        Under the edited map, and what was asked for, linear radiance.
-    coverage, counts : ndarray (h, w, 1)
-        How much each pixel was painted; which count.
+    ``rendering`` and ``aim`` (h, w, 3) are linear radiance, under the edited map and as asked for;
+    ``coverage`` and ``counts`` (h, w, 1) say how much each pixel was painted, and which count.
     """
     rest = ((coverage <= 0) & (counts > 0))[..., 0]
     if not rest.any():
         return 0.0
     return float(np.abs(tonemap(rendering[rest]) - tonemap(aim[rest])).mean())
-
-
-def raised(hold: float, changed: float) -> float | None:
-    """Return a larger weight of what was not painted; None if it has changed too little for that.
-
-    Residuals count by their squares: the weight grows with the square of the change.
-    """
-    if changed <= VISIBLE or hold >= LARGEST_HOLD:
-        return None
-    return min(LARGEST_HOLD, hold * float(np.clip((changed / VISIBLE) ** 2, LEAST_RAISE, LARGEST_RAISE)))
 
 
 def said(weight: float, changed: float) -> str:
@@ -59,15 +45,14 @@ def further(
 ) -> float | None:
     """Return the weight with which an edit goes on; None where it need not, or where the weight was given.
 
-    Parameters
-    ----------
-    chosen : Target
-        Table ``[target]``: ``hold`` and ``paint``.
-    weight : float
-        Of what was not painted, in the steps that led to ``rendering``.
-    rendering, aim, *pixels
-        As for ``change``.
+    Residuals count by their squares: the weight grows with the square of the change, if that is visible.
+    ``chosen`` is table ``[target]``, ``weight`` that of what was not painted, in the steps that led to
+    ``rendering``; further arguments are those of :func:`change`.
     """
     if chosen.hold != "auto" or chosen.rest == "follow" or not chosen.paint:
         return None
-    return raised(weight, change(rendering, aim, *pixels))
+    changed = change(rendering, aim, *pixels)
+    if changed <= VISIBLE or weight >= LARGEST_HOLD:
+        return None
+    factor = float(np.clip((changed / VISIBLE) ** 2, LEAST_RAISE, LARGEST_RAISE))
+    return min(LARGEST_HOLD, weight * factor)

@@ -32,27 +32,13 @@ grids made maps worse (matpreview, principled: by 1 to 4 dB), with colours that 
 
 @dataclass(frozen=True)
 class Recordings:
-    """What lights are looked for through.
+    """What lights are looked for through."""
 
-    Attributes
-    ----------
-    transport : LightTransport
-        T; the one that the run renders through, where it does.
-    second : LightTransport or None
-        Another recording of T, where detail is asked about.
-    octaves : list of Octave
-        Detail that the picture determines; see :func:`.gain_bandwidth.octaves`.
-    notes : list of str
-        What was found and chosen.
-    views : tuple of slice
-        Rows of each view.
-    """
-
-    transport: LightTransport
-    second: LightTransport | None = None
+    transport: LightTransport  # T; the one that the run renders through, where it does
+    second: LightTransport | None = None  # another recording of T, where detail is asked about
+    # Detail that the picture determines; see :func:`.gain_bandwidth.octaves`
     octaves: list[Octave] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)
-    views: tuple[slice, ...] = ()
+    notes: list[str] = field(default_factory=list)  # what was found and chosen
 
 
 def recordings(
@@ -67,25 +53,12 @@ def recordings(
     """Trace what lights are looked for through: T, and a second recording where detail is asked about.
 
     Where detail is identifiable, a gain fine enough for it follows the noise of T: a large picture, whose
-    pixels "auto" gives few samples each, gets as many as memory allows. On a mirror of 256x256 pixels the
-    map gains 1.6 dB over eight maps; without detail, pixels make up for each other.
+    pixels "auto" gives few samples each, gets as many as memory allows. On a mirror of 256x256 pixels the map
+    gains 1.6 dB over eight maps; without detail, pixels make up for each other. What is painted need not be
+    what any light does: detail would follow it, and is not asked about.
 
-    Parameters
-    ----------
-    settings : config.Config
-        Of the run.
-    scene : Scene
-        The scene.
-    shape : (int, int)
-        Rows and columns of the maps.
-    layers : Layers
-        The representation, after :meth:`.Layers.encode`.
-    target : Target
-        What the picture should be. What is painted need not be what any light does: detail would follow it.
-    traced : LightTransport, optional
-        T, where the run renders through it; of no use any more if another one is returned.
-    progress : callable, optional
-        Receives the blocks of pixels done, and all.
+    ``shape`` is (H, W) of the maps. ``traced`` is T, where the run renders through it; of no use any more if
+    another one is returned. ``progress`` receives the blocks of pixels done, and all.
     """
 
     def trace(seed, **changed):
@@ -109,8 +82,15 @@ def recordings(
         memory_gb=recording.gigabytes(pixels, few, min(SECOND_COLUMNS, transport.capacity) + 1),
         refresh=0,
     )
-    asked = layers.separation.background, layers.rows, target.picture, target.weight
-    octaves = gain_bandwidth.octaves(transport, second, *asked, 2 * CYCLES)
+    octaves = gain_bandwidth.octaves(
+        transport,
+        second,
+        layers.separation.background,
+        layers.rows,
+        target.picture,
+        target.weight,
+        2 * CYCLES,
+    )
     shares = ", ".join(f"{100 * octave.share:.0f} % at {octave.cycles} cycles" for octave in octaves)
     least = f"below {100 * gain_bandwidth.FIRST_SHARE:.0f} % at {2 * CYCLES} cycles"
     notes = [f"sky area with identifiable detail: {shares or least}"]
@@ -127,20 +107,14 @@ def recordings(
             transport = trace(settings.seed, spp=most)
     # Columns of both are compared: their paths are in the ratio of the samples.
     second.paths = tuple(max(1, round(n * second.spp / transport.spp)) for n in transport.paths)
-    return Recordings(transport, second, octaves, notes, scene.rows)
+    return Recordings(transport, second, octaves, notes)
 
 
 def trusted(envmap: np.ndarray, recordings: Recordings, target: Target) -> tuple[Target, list[str]]:
     """Weigh a rendered target's pixels by what is known of them under a map; returns the target and notes.
 
-    Parameters
-    ----------
-    envmap : ndarray (H, W, 3)
-        The map as far as it is solved: images of lights, and caustics, are where the lights now are.
-    recordings : Recordings
-        Of :func:`recordings`, with a second one; their bright columns may change.
-    target : Target
-        What the picture should be.
+    ``envmap`` (H, W, 3) is the map as far as it is solved: images of lights, and caustics, are where the
+    lights now are. ``recordings`` has a second one; the bright columns of both may change.
     """
     pictures = []
     for one in (recordings.transport, recordings.second):
@@ -148,13 +122,13 @@ def trusted(envmap: np.ndarray, recordings: Recordings, target: Target) -> tuple
         pictures.append(one.apply(mi.TensorXf(envmap)).numpy())
     share = recordings.second.spp / recordings.transport.spp
     first, second = pictures
-    asked = target.picture, target.noise, recordings.views
-    weight = pixel_confidence.weights(first, second, share, *asked)
+    views = recordings.transport.scene.rows
+    weight = pixel_confidence.weights(first, second, share, target.picture, target.noise, views)
     if weight is None:
         return target, []
     noisy = 100 * float((weight < 0.5).mean())
-    said = f"{noisy:.3g} % of the pixels are dominated by Monte Carlo noise and down-weighted"
+    note = f"{noisy:.3g} % of the pixels are dominated by Monte Carlo noise and down-weighted"
     weight = weight if target.weight is None else weight * target.weight
     if not weight.any():  # a mask around nothing but noise: better that than nothing
         return target, []
-    return replace(target, weight=(weight / max(float(weight.mean()), 1e-30)).astype(np.float32)), [said]
+    return replace(target, weight=(weight / max(float(weight.mean()), 1e-30)).astype(np.float32)), [note]

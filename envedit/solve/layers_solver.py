@@ -30,27 +30,15 @@ CHECKED_SPP = 64
 
 @dataclass
 class LayersSolver:
-    """Solver of one edit of layers.
+    """Solver of one edit of layers."""
 
-    Attributes
-    ----------
-    edit : EditState
-        What is edited.
-    begun : gauss_newton.Run, optional
-        Where :meth:`optimise` goes on from.
-    others : tuple of search.Explanation
-        Of paint: explanations that are less likely than the one that is solved for.
-    posterior : Posterior, optional
-        How well the target determines the sky, once :meth:`optimise` knows it.
-    note : str
-        What a user should know of the solution.
-    """
-
-    edit: EditState
-    begun: gauss_newton.Run | None = None
+    edit: EditState  # what is edited
+    begun: gauss_newton.Run | None = None  # where :meth:`optimise` goes on from
+    # Of paint: explanations that are less likely than the one that is solved for
     others: tuple[search.Explanation, ...] = ()
+    # How well the target determines the sky, once :meth:`optimise` knows it
     posterior: Posterior | None = None
-    note: str = ""
+    note: str = ""  # what a user should know of the solution
     _likelier: list[str] = field(default_factory=list)
     _curves: dict[str, float] = field(default_factory=dict)
 

@@ -41,12 +41,7 @@ class Place:
 
 
 class Places:
-    """Places of lights that are dark at a point.
-
-    Parameters
-    ----------
-    problem, point, normal : Problem, Point, Normal
-        What is minimised, where, and its normal equations there.
+    """Places of lights that are dark at a point, by the problem's normal equations there.
 
     Raises
     ------

@@ -43,23 +43,13 @@ VISIBLE = 0.02
 
 @dataclass(frozen=True)
 class Likelihood:
-    """The likelihood of residuals.
+    """The likelihood of residuals."""
 
-    Attributes
-    ----------
-    weight : ndarray (h, w, 1)
-        How much each pixel counts beside the others; 1 on average (:func:`on_average_one`).
-    independent : float
-        Independent values of a channel among the pixels.
-    paint_noise : float or None
-        Largest standard error of paint, of display values; None: a rendering.
-    rest : ndarray (h, w, 1) or None
-        How much each pixel is of the rest, in [0, 1], whose mean is to stay; None: there is none.
-    """
-
+    # (h, w, 1), how much each pixel counts beside the others; 1 on average (:func:`on_average_one`)
     weight: np.ndarray
-    independent: float = INDEPENDENT
-    paint_noise: float | None = None
+    independent: float = INDEPENDENT  # independent values of a channel among the pixels
+    paint_noise: float | None = None  # largest standard error of paint, of display values; None: a rendering
+    # (h, w, 1), how much each pixel is of the rest, in [0, 1], whose mean is to stay; None: there is none
     rest: np.ndarray | None = None
 
     @classmethod
@@ -68,12 +58,8 @@ class Likelihood:
     ) -> Likelihood:
         """Return the likelihood of a painted picture; its rest counts for as much as it weighs beside paint.
 
-        Parameters
-        ----------
-        weight, coverage : ndarray (h, w, 1)
-            How much each pixel counts, and was painted.
-        initial, picture : ndarray (h, w, 3)
-            What was painted on, and the painted picture, linear radiance.
+        ``weight`` and ``coverage`` (h, w, 1) say how much each pixel counts, and was painted; ``initial`` and
+        ``picture`` (h, w, 3) are what was painted on, and the painted picture, linear radiance.
         """
         # Weights are a c + b (1 - c): b is that of pixels without paint.
         bare = weight[(coverage <= 0) & (weight > 0)]

@@ -55,39 +55,24 @@ LARGEST_STEP = {
 
 @dataclass(frozen=True)
 class Photographed:
-    """What a photograph adds to a problem.
+    """What a photograph adds to a problem."""
 
-    Attributes
-    ----------
-    log_factor : ndarray (3,)
-        Of exposure and white balance, by which the target has been divided, less what they are drawn to: the
-        unknown is the rest.
-    precision : ndarray (3, 3)
-        Inverse covariance of their sum, about 0.
-    clipped : ndarray of bool (h, w, 3)
-        Where the target is a lower bound.
-    """
-
+    # (3,), exposure and white balance by which the target has been divided, less what they are drawn to
     log_factor: np.ndarray
-    precision: np.ndarray
-    clipped: np.ndarray
+    precision: np.ndarray  # (3, 3), inverse covariance of their sum, about 0
+    clipped: np.ndarray  # bool (h, w, 3), where the target is a lower bound
 
 
 @dataclass(frozen=True)
 class Posterior:
-    """How well a picture determines the sky.
+    """How well a picture determines the sky."""
 
-    Attributes
-    ----------
-    deviation, prior : ndarray (H, W)
-        Standard deviation of the log luminance gain with and without the picture; 0 outside the active rows.
-    sample : callable or None
-        Draws parameters of the layers with a generator of numbers: in Laplace's approximation, as likely as
-        picture and prior make them. None where the normal equations cannot be solved.
-    """
-
+    # deviation, prior: (H, W), standard deviation of the log luminance gain with and without the picture; 0
+    # outside the active rows
     deviation: np.ndarray
     prior: np.ndarray
+    # Draws parameters of the layers with a generator of numbers: in Laplace's approximation, as likely as
+    # picture and prior make them. None where the normal equations cannot be solved
     sample: Callable[[np.random.Generator], dict] | None = None
 
     @property
@@ -195,13 +180,9 @@ class Problem(Unknowns):
             return slope
         return np.where(self.photo.clipped & (point.residual >= 0), 0, slope).astype(np.float32)
 
-    def noise(self, residual: np.ndarray, least: float) -> float:
-        """Return the most likely standard error (:meth:`.Likelihood.noise`)."""
-        return self.likelihood.noise(residual, least)
-
     def loss(self, point: Point, start: dict, sigma: float) -> float:
         """Return F."""
-        return self.misfit(point.residual, sigma) + self.penalty(point.state, start)
+        return self.likelihood.misfit(point.residual, sigma) + self.penalty(point.state, start)
 
     def penalty(self, state: dict, start: dict) -> float:
         """Return x' K x; ``start`` is where the search has put the lights."""
@@ -224,10 +205,6 @@ class Problem(Unknowns):
 
     def _angle(self, state, start, i):
         return float(np.linalg.norm(rotation_between(self.direction(start, i), self.direction(state, i))))
-
-    def misfit(self, residual: np.ndarray, sigma: float) -> float:
-        """Return the first part of F."""
-        return self.likelihood.misfit(residual, sigma)
 
     # ---- normal equations ----------------------------------------------------------------------------------
 

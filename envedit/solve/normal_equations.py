@@ -12,44 +12,24 @@ ROWS = 64
 
 @dataclass(frozen=True)
 class Blocks:
-    """What normal equations are made of, by blocks of pixels.
+    """What normal equations are made of, by blocks of pixels."""
 
-    Attributes
-    ----------
-    jacobian : list of ndarray (blocks, n)
-        Of the gain, per channel.
-    squared, pulled : ndarray (blocks, 3)
-        Sums of weight times slope squared, and of weight, slope and residual.
-    lights : list of ndarray (blocks, k)
-        Sums of weight times slope squared times pictures of lights, per channel; empty without lights.
-    """
-
-    jacobian: list[np.ndarray]
+    jacobian: list[np.ndarray]  # (blocks, n), of the gain, per channel
+    # squared, pulled: (blocks, 3), sums of weight times slope squared, and of weight, slope and residual
     squared: np.ndarray
     pulled: np.ndarray
+    # (blocks, k), sums of weight times slope squared times pictures of lights, per channel; may be empty
     lights: list[np.ndarray]
 
 
 @dataclass(frozen=True)
 class MeanOfRest:
-    """The mean of what was not painted, q of ``likelihood.py``, as one more residual of each channel.
+    """The mean of what was not painted, q of ``likelihood.py``, as one more residual of each channel."""
 
-    Attributes
-    ----------
-    jacobian : ndarray (3, m)
-        Its derivatives by the unknowns.
-    residual : ndarray (3,)
-        Its value.
-    by_pixels : ndarray (h, w, 3)
-        Its derivatives by the radiance of pixels.
-    by_blocks : ndarray (blocks, 3)
-        These times the profile, summed over blocks.
-    """
-
-    jacobian: np.ndarray
-    residual: np.ndarray
-    by_pixels: np.ndarray
-    by_blocks: np.ndarray
+    jacobian: np.ndarray  # (3, m), its derivatives by the unknowns
+    residual: np.ndarray  # (3,), its value
+    by_pixels: np.ndarray  # (h, w, 3), its derivatives by the radiance of pixels
+    by_blocks: np.ndarray  # (blocks, 3), these times the profile, summed over blocks
 
 
 @dataclass(frozen=True)

@@ -57,57 +57,32 @@ class Prior:
     """How far a sky changes: standard deviations, the same for every scene and map.
 
     Those of a rendered target, which may be of quite another sky; of a painted one see :func:`of_paint`.
-
-    Attributes
-    ----------
-    luminance : float
-        Of the mean log gain on the coarsest grid: 1 is a factor of e.
-    chroma : float
-        Of its blue-amber difference, along which daylight varies: 0.3 is 30 %.
-    tint : float
-        Of its green-magenta difference, which skies hardly have.
-    flux : float
-        Of a light's mean log flux; for the map's own lights around their original flux.
-    flux_chroma : float
-        Of the blue-amber difference of a light's log flux: from the horizon to high above it, that of the sun
-        changes by a factor of e and more. Green-magenta is as of the sky.
-    turn : float
-        Of a light's direction, radians from where the search has put it.
-    size, added_size : float
-        Of a light's log size: of the map's own, and of a light that is added, which may be haze or a sun.
-    saturation : float
-        Of the log saturation of the sky's colours.
-    freedom : float or None
-        How far the gain may go, in units of how photographed skies differ (:data:`PHOTOGRAPHED`); None: as
-        ``luminance``, ``chroma`` and ``tint`` say, node by node.
-    factor : float
-        The same of one factor for the whole sky, where ``freedom`` is set.
     """
 
-    luminance: float = 1.0
-    chroma: float = 0.3
-    tint: float = 0.1
-    flux: float = 1.5
+    luminance: float = 1.0  # of the mean log gain on the coarsest grid: 1 is a factor of e
+    chroma: float = 0.3  # of its blue-amber difference, along which daylight varies: 0.3 is 30 %
+    tint: float = 0.1  # of its green-magenta difference, which skies hardly have
+    flux: float = 1.5  # of a light's mean log flux; for the map's own lights around their original flux
+    # Of the blue-amber difference of a light's log flux: from the horizon to high above it, that of the sun
+    # changes by a factor of e and more. Green-magenta is as of the sky
     flux_chroma: float = 1.0
-    turn: float = np.radians(10.0)
+    turn: float = np.radians(10.0)  # of a light's direction, radians from where the search has put it
+    # size, added_size: of a light's log size: of the map's own, and of a light that is added, which may be
+    # haze or a sun
     size: float = 0.3
     added_size: float = 1.0
-    saturation: float = 1.0
+    saturation: float = 1.0  # of the log saturation of the sky's colours
+    # How far the gain may go, in units of how photographed skies differ (:data:`PHOTOGRAPHED`); None: as
+    # ``luminance``, ``chroma`` and ``tint`` say, node by node
     freedom: float | None = None
-    factor: float = LEAST_WHOLE_FREEDOM
+    factor: float = LEAST_WHOLE_FREEDOM  # the same of one factor for the whole sky, where ``freedom`` is set
 
     def gain_precisions(self, gain: GridGain, ground: bool = False) -> np.ndarray:
         """Return the inverse covariance of the nodes' log gain along luminance, chroma and tint: (3, n, n).
 
         With :attr:`freedom` the nodes of the finest grid differ as photographed skies do, times freedom, and
         coarser grids, which it contains, stay at 0; without, every node has its own standard deviation.
-
-        Parameters
-        ----------
-        gain : GridGain
-            Whose nodes these are.
-        ground : bool
-            The last node is the factor of ground, which changes as a coarse node of the sky.
+        ``ground``: the last node is the factor of ground, which changes as a coarse node of the sky.
         """
         coarse = [rows * columns for rows, columns in gain.sizes]
         if self.freedom is None:
@@ -135,17 +110,11 @@ class Prior:
 
 
 def of_paint(freedom: float, coverage: np.ndarray | None = None) -> Prior:
-    """Return the prior of painted targets.
+    """Return the prior of painted targets, of a freedom in units of how photographed skies differ.
 
     Paint that asks for another brightness is no reason for another colour of a light: a third of what a
-    rendered target may change. One factor for the whole sky is as free as the picture is painted.
-
-    Parameters
-    ----------
-    freedom : float
-        How far the gain may go, in units of how photographed skies differ.
-    coverage : ndarray (h, w, 1), optional
-        How much each pixel was painted; None: nothing was.
+    rendered target may change. One factor for the whole sky is as free as the picture is painted:
+    ``coverage`` (h, w, 1) is how much each pixel was, None: nothing.
     """
     painted = 0.0 if coverage is None else float(coverage.mean(dtype=np.float64))
     factor = max(LEAST_WHOLE_FREEDOM, freedom, painted)

@@ -51,24 +51,14 @@ added to a map without any."""
 
 @dataclass(frozen=True)
 class Explanation:
-    """A solution after a few steps.
+    """A solution after a few steps."""
 
-    Attributes
-    ----------
-    done : dict of int to str
-        What was done to lights, by their numbers.
-    run, point : Run, Point
-        Where the solution goes on.
-    score : float
-        -2 log evidence, but for a constant.
-    others : tuple of Explanation
-        Of the likeliest that :func:`search` finds: the next ones, each of another :attr:`name`.
-    """
-
-    done: dict[int, str]
+    done: dict[int, str]  # what was done to lights, by their numbers
+    # run, point: where the solution goes on
     run: gauss_newton.Run
     point: Point
-    score: float
+    score: float  # -2 log evidence, but for a constant
+    # Of the likeliest that :func:`search` finds: the next ones, each of another :attr:`name`
     others: tuple[Explanation, ...] = ()
 
     @property
@@ -102,20 +92,10 @@ def search(
     after_step: Callable[[], None] | None = None,
     most: int = EXPLANATION_STEPS,
 ) -> Explanation:
-    """Find the likeliest explanation.
+    """Find the likeliest explanation, from ``start``, the state of the map as it is.
 
-    Parameters
-    ----------
-    problem : Problem
-        Of a rendered or a painted target.
-    start : dict
-        State of the map as it is.
-    sigma : float
-        Least standard error of display values.
-    after_step : callable, optional
-        Called now and then; what it raises ends the search.
-    most : int
-        Most Gauss-Newton steps after which explanations are compared.
+    ``sigma`` is the least standard error of display values, ``most`` bounds the Gauss-Newton steps after
+    which explanations are compared. ``after_step`` is called now and then; what it raises ends the search.
     """
     steps = min(most, EXPLANATION_STEPS)
     best = _descended(problem, {}, gauss_newton.Run(start, start), sigma, steps)
@@ -139,12 +119,7 @@ def further(
 ) -> Explanation | None:
     """Find an explanation that is likelier than a solution, whose sky it begins with; None if there is none.
 
-    Parameters
-    ----------
-    problem, sigma, after_step
-        As for :func:`search`.
-    run : Run
-        Where no step leads further.
+    ``run`` is where no step leads further; other parameters are those of :func:`search`.
     """
     point = problem.evaluate(run.state, resolve=False)
     best = Explanation({}, run, point, score(problem, run, point, sigma))
@@ -170,7 +145,7 @@ def _others(best, compared):
 def _unfollowed(problem, best, sigma):
     """Whether paint is followed so little that its noise is the largest there may be."""
     most = problem.likelihood.paint_noise
-    return most is not None and problem.noise(best.point.residual, sigma) >= most
+    return most is not None and problem.likelihood.noise(best.point.residual, sigma) >= most
 
 
 def _neighbours(problem, best, moves, sigma, after_step, steps, sky):
@@ -197,7 +172,7 @@ def score(problem: Problem, run: gauss_newton.Run, point: Point, sigma: float) -
     if point.residual is None:
         return np.inf
     # ---- -2 log of likelihood and prior, at the most likely noise
-    noise = problem.noise(point.residual, sigma)
+    noise = problem.likelihood.noise(point.residual, sigma)
     unlikeliness = problem.likelihood.at_best(point.residual, sigma) + problem.penalty(run.state, run.start)
     # ---- log det H - log det K
     normal = problem.normal(point, run.start, noise, descent=False)
@@ -281,7 +256,9 @@ def _places(problem, state, start, sigma):
     if point.residual is None:
         return None
     try:
-        return Places(problem, point, problem.normal(point, start, problem.noise(point.residual, sigma)))
+        return Places(
+            problem, point, problem.normal(point, start, problem.likelihood.noise(point.residual, sigma))
+        )
     except np.linalg.LinAlgError:
         return None
 

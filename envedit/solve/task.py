@@ -29,17 +29,7 @@ def problem(
     envmap: np.ndarray,
     blocks: BlockJacobian | None = None,
 ) -> Problem:
-    """Return what is minimised.
-
-    Parameters
-    ----------
-    settings : config.Config
-        Of the run: ``solve.freedom``.
-    target : Target
-        What the renderer is to make.
-    layers, transport, envmap, blocks
-        As for :class:`.Problem`.
-    """
+    """Return what is minimised; parameters are those of :class:`.Problem`, and ``solve.freedom`` counts."""
     painted, photograph = target.coverage is not None, None
     if target.photo is not None:
         photo = target.photo

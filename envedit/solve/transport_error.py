@@ -29,22 +29,10 @@ STEPS = 6
 def corrected(
     target: Target, scene: Scene, envmap: np.ndarray, rendering: np.ndarray, seed: int, keep: bool = True
 ) -> Target:
-    """Return a target whose aim is the picture as T would show it near a map.
+    """Return a target whose aim is the picture as T would show it near a map E^ (H, W, 3).
 
-    Parameters
-    ----------
-    target : Target
-        The target; its picture stays.
-    scene : Scene
-        The scene.
-    envmap : ndarray (H, W, 3)
-        E^.
-    rendering : ndarray (h, w, 3)
-        R(E^).
-    seed : int
-        That of the configuration.
-    keep : bool
-        Keep I on disk: a run that is killed and resumed has the same.
+    Its picture stays. ``rendering`` (h, w, 3) is R(E^), ``seed`` that of the configuration. ``keep``: I is
+    kept on disk, and a run that is killed and resumed has the same.
     """
     shown, _, _ = rendered(scene, envmap, SPP, Seeds.of(seed).solution_check, keep)
     return target.seen_as(rendering, shown)

@@ -33,21 +33,13 @@ keep their bits then."""
 
 @dataclass(frozen=True)
 class Turn:
-    """A turn of the sky.
+    """A turn of the sky."""
 
-    Attributes
-    ----------
-    degrees : float
-        As for :func:`.latlong.rotate`.
-    error, still : float
-        Display residual, as of :func:`apart`, with the turn alone and without.
-    blocks : float
-        The share of the residual of blocks that the turn leaves, beyond what the block transport errs by.
-    """
-
-    degrees: float
+    degrees: float  # as for :func:`.latlong.rotate`
+    # error, still: display residual, as of :func:`apart`, with the turn alone and without
     error: float
     still: float
+    # The share of the residual of blocks that the turn leaves, beyond what the block transport errs by
     blocks: float = np.inf
 
     @property
@@ -66,22 +58,10 @@ def find(
 ) -> Turn:
     """Find the turn of a map that explains a picture best.
 
-    Parameters
-    ----------
-    transport : LightTransport
-        T; its block transport is used.
-    render : callable
-        Renders a map (H, W, 3) to (h, w, 3), linear radiance, with the same samples each time; those of an
-        integer from 0.
-    envmap : ndarray (H, W, 3)
-        The map.
-    picture : ndarray (h, w, 3)
-        The target, linear radiance.
-    weight : ndarray (h, w, 1), optional
-        How much each pixel counts.
-    thorough : bool
-        Render turns in any case; otherwise only where the block transport shows that a turn explains
-        something (:data:`LEAST_EXPLAINED`, :data:`BLOCK_ERROR_FACTOR`), and no turn is found elsewhere.
+    ``render(envmap, k)`` renders a map (H, W, 3) to (h, w, 3), linear radiance, with the same samples each
+    time, those of the integer k from 0. ``picture`` (h, w, 3) is the target, ``weight`` (h, w, 1) how much
+    each pixel counts. ``thorough``: turns are rendered in any case; otherwise only where the block transport
+    shows that one explains something (:data:`LEAST_EXPLAINED`, :data:`BLOCK_ERROR_FACTOR`).
     """
     width = envmap.shape[1]
     rendering = render(envmap, 0)
@@ -147,12 +127,8 @@ def _fraction(render, maps, picture, weight):
 def apart(rendering: np.ndarray, picture: np.ndarray, weight: np.ndarray | None = None) -> float:
     """Return a rendering's display residual, RMS over channels and mean over pixels; inf if it is not finite.
 
-    Parameters
-    ----------
-    rendering, picture : ndarray (h, w, 3)
-        Linear radiance.
-    weight : ndarray (h, w, 1), optional
-        How much each pixel counts.
+    ``rendering`` and ``picture`` (h, w, 3) are linear radiance; ``weight`` (h, w, 1): how much each pixel
+    counts.
     """
     size = np.sqrt(np.square(residuals(rendering, picture)).mean(axis=2, keepdims=True))
     mean = size.mean() if weight is None else (size * weight).mean() / max(float(weight.mean()), 1e-30)

@@ -42,14 +42,7 @@ class Point:
 class Unknowns:
     """The unknowns of some layers.
 
-    Parameters
-    ----------
-    layers : Layers
-        After ``encode``.
-    saturates : bool
-        The saturation of the sky's colours is an unknown.
-    photographed : bool
-        The factor of a camera is an unknown.
+    ``saturates``: the saturation of the sky's colours is one; ``photographed``: the factor of a camera is.
 
     Attributes
     ----------
@@ -107,18 +100,11 @@ class Unknowns:
     def moved(
         self, state: dict, step: np.ndarray, names: list, largest: dict[str, float] | None = None
     ) -> dict[str, np.ndarray]:
-        """Return the state after a step.
+        """Return the state after a step (3 nodes + len(names),).
 
-        Parameters
-        ----------
-        state : dict
-            Before.
-        step : ndarray (3 nodes + len(names),)
-            The gain's nodes channel by channel, then what is named.
-        names : list of (str, int, int or ndarray (3,))
-            Which unknown, of which light, and which channel or axis of its turn.
-        largest : dict, optional
-            Largest step of each; None: any.
+        It is of the gain's nodes channel by channel, then of what is named. A name is which unknown, of which
+        light, and which channel or axis (3,) of its turn; ``largest`` bounds the step of each, by default not
+        at all.
         """
         kinds = "gain", "turn", "flux", "size", "saturation", "camera"
         bound = dict.fromkeys(kinds, np.inf) | (largest or {})

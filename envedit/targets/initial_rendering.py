@@ -87,26 +87,11 @@ def _clipped(shown):
 def export(
     file: FilePath, picture: np.ndarray, settings: config.Config, name: str | None = None
 ) -> list[str]:
-    """Write the picture to paint on: float32 OpenEXR, or 16-bit PNG.
+    """Write the picture to paint on, (h, w, 3) linear radiance; returns warnings.
 
-    The file says which tonemap it is under, and what it was rendered from. As editors drop that, a file
-    beside it, with :data:`NEIGHBOUR` after its name, says it too.
-
-    Parameters
-    ----------
-    file : path-like
-        Ends in .exr or .png, and is not there yet.
-    picture : ndarray (h, w, 3)
-        Linear radiance, of :func:`initial`.
-    settings : config.Config
-        What it was made from.
-    name : str, optional
-        Its tonemap; by default that of :func:`export_tonemap`.
-
-    Returns
-    -------
-    list of str
-        Warnings.
+    It is float32 OpenEXR, or 16-bit PNG. The file says which tonemap it is under (``name``, by default
+    :func:`export_tonemap`), and what it was rendered from. As editors drop that, a file beside it, with
+    :data:`NEIGHBOUR` after its name, says it too.
 
     Raises
     ------
@@ -138,17 +123,7 @@ def export(
 
 
 def origin(settings: config.Config, shape: Shape, name: str) -> Info:
-    """Return what an exported picture says of itself.
-
-    Parameters
-    ----------
-    settings : config.Config
-        What it is made from.
-    shape : tuple
-        (h, w, ...) of the picture.
-    name : str
-        Its tonemap.
-    """
+    """Return what an exported picture (h, w, ...) under a tonemap of this name says of itself."""
     return {
         "tonemap": name,
         "scene": Path(settings.scene.file).name,
@@ -165,21 +140,9 @@ def stated_origin(file: FilePath, info: Info, expected: Mapping[str, object]) ->
     """Return what a painted picture was exported with, as its metadata or a file beside it says.
 
     The file beside it is the one with its name, where it was saved over the export; otherwise, of those in
-    its folder that are of the same scene, one that agrees with this run, or else the first.
-
-    Parameters
-    ----------
-    file : path-like
-        The picture.
-    info : dict
-        Of :func:`envedit.images.images.read_stored`.
-    expected : mapping
-        What an export of this run says (:func:`origin`).
-
-    Returns
-    -------
-    dict
-        As :func:`origin`, values as text; empty where nothing is said.
+    its folder that are of the same scene, one that agrees with this run, or else the first. ``info`` is of
+    :func:`envedit.images.images.read_stored`, ``expected`` what an export of this run says. What is returned
+    is as :func:`origin`, values as text; empty where nothing is said.
 
     Raises
     ------
@@ -187,31 +150,31 @@ def stated_origin(file: FilePath, info: Info, expected: Mapping[str, object]) ->
         If a value of :data:`KEYS` is not that of this run: the rendering is not the one that was painted on.
     """
     file = Path(os.fsdecode(file))
-    said = {k[len(_PREFIX) :]: str(v) for k, v in info["metadata"].items() if k.startswith(_PREFIX)}
+    facts = {k[len(_PREFIX) :]: str(v) for k, v in info["metadata"].items() if k.startswith(_PREFIX)}
     neighbour = None
-    if not said:
-        said, neighbour = _beside(file, expected)
+    if not facts:
+        facts, neighbour = _beside(file, expected)
         if neighbour is not None and (info["hdr"] or neighbour.name.lower().endswith(f".exr{NEIGHBOUR}")):
-            said.pop("tonemap", None)  # of another format
-    if keys := _differing(said, expected):
-        stated = ", ".join(f"{KEYS[key]} {said[key][:20]!a}".replace("'", "") for key in keys)
+            facts.pop("tonemap", None)  # of another format
+    if keys := _differing(facts, expected):
+        stated = ", ".join(f"{KEYS[key]} {facts[key][:20]!a}".replace("'", "") for key in keys)
         own = ", ".join(str(expected[key]) for key in keys)
         source = "was" if neighbour is None else f"{neighbour.name} says that it was"
         remedy = "give these to this run, or export it again"
         remedy += "" if neighbour is None else f"; if it is no such picture, remove {neighbour.name}"
         raise InputError(f"{file}: {source} exported with {stated}, where this run has {own}: {remedy}")
-    return said
+    return facts
 
 
-def _differing(said, expected):
+def _differing(facts, expected):
     """Return the keys of :data:`KEYS` whose values differ."""
-    return [key for key in KEYS if key in said and said[key] != str(expected.get(key, said[key]))]
+    return [key for key in KEYS if key in facts and facts[key] != str(expected.get(key, facts[key]))]
 
 
 def _beside(file, expected):
     """Return what a file beside a picture says of its export, and the file; {} and None without one."""
     own = file.with_name(f"{file.name}{NEIGHBOUR}")
-    found = {}
+    stated = {}
     for path in filter(os.path.isfile, (own, *sorted(file.parent.glob(f"*{NEIGHBOUR}")))):
         try:
             with open(path, "rb") as stream:
@@ -219,9 +182,9 @@ def _beside(file, expected):
         except (OSError, ValueError, RecursionError):  # no JSON, or none of ours
             continue
         if isinstance(facts, dict) and (path == own or facts.get("scene") == expected.get("scene")):
-            found[path] = {str(key): str(value) for key, value in facts.items()}
-    if not found:
+            stated[path] = {str(key): str(value) for key, value in facts.items()}
+    if not stated:
         return {}, None
-    agreeing = [path for path, facts in found.items() if not _differing(facts, expected)]
-    chosen = own if own in found else (agreeing or list(found))[0]
-    return found[chosen], chosen
+    agreeing = [path for path, facts in stated.items() if not _differing(facts, expected)]
+    chosen = own if own in stated else (agreeing or list(stated))[0]
+    return stated[chosen], chosen

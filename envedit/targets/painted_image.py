@@ -8,7 +8,6 @@ format.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from types import MappingProxyType
 
 import numpy as np
@@ -20,33 +19,12 @@ from envedit.core.types import FilePath, Shape
 from envedit.images import images
 from envedit.targets import initial_rendering
 from envedit.targets.paint_detection import differs
+from envedit.targets.strokes import Painted
 
 NEARLY_ALL = 0.9
 MOST_RESIZED = 16
 """Times as wide, or as narrow, as the rendering that a picture may be: others are no resized exports."""
 NOTHING: Mapping[str, object] = MappingProxyType({})
-
-
-@dataclass(frozen=True)
-class Painted:
-    """A painted picture.
-
-    Attributes
-    ----------
-    picture : ndarray (h, w, 3) float32
-        Linear radiance; where nothing was painted the initial rendering's own, if that is known.
-    coverage : ndarray (h, w, 1) float32
-        How much each pixel was painted, in [0, 1].
-    excluded : ndarray of bool (h, w)
-        Pixels without information: clipped, or transparent over nothing.
-    warnings : tuple of str
-        What the user should know.
-    """
-
-    picture: np.ndarray
-    coverage: np.ndarray
-    excluded: np.ndarray
-    warnings: tuple[str, ...]
 
 
 # ----------------------------------------------------------------------------------------------------------
@@ -99,7 +77,7 @@ def read(
     # ---- The file, and what it says of itself
     pixels, info = images.read_stored(file)
     file = info["path"]
-    said = initial_rendering.stated_origin(file, info, exported)
+    facts = initial_rendering.stated_origin(file, info, exported)
     warnings = [f"{file}: {line}" for line in info["warnings"]]
     spread = _spread_of_resampling(file, pixels.shape, shape, warnings)
     check_finite(file, pixels, "repair it in the program it came from (half floats end at 65504)")
@@ -114,7 +92,7 @@ def read(
 
     # ---- The tonemap, and the rendering under it
     before = None
-    name = _tonemap_of(file, info, said, tonemap_name, exported, warnings)
+    name = _tonemap_of(file, info, facts, tonemap_name, exported, warnings)
     if initial is not None:
         if not info["hdr"] and "envedit.tonemap" not in info["metadata"]:
             seen = (alpha > 0) & ~clipped & (initial > 0).any(axis=2)
@@ -135,13 +113,13 @@ def read(
     if before is not None:
         painted &= differs(values, before, info, top, spread)
         if not mask:
-            other = {key: value for key, value in said.items() if value != str(exported.get(key))}
+            other = {key: value for key, value in facts.items() if value != str(exported.get(key))}
             _check_painted(file, painted, before, info, other, top, warnings)
     coverage = alpha * (read_mask(mask, shape)[..., 0] if mask else painted)
     if not coverage.any():
-        facts = f" ({'; '.join(info['warnings'])})" if info["warnings"] else ""
+        remarks = f" ({'; '.join(info['warnings'])})" if info["warnings"] else ""
         raise InputError(
-            f"{file}: nothing of it is painted{facts}; paint on it, or give a mask that is white there"
+            f"{file}: nothing of it is painted{remarks}; paint on it, or give a mask that is white there"
         )
     excluded = clipped | (alpha == 0)
     if before is not None:
@@ -271,12 +249,12 @@ def check_finite(file: FilePath, pixels: np.ndarray, advice: str) -> None:
         raise InputError(f"{file}: pixel at {place_of(bad)} is not finite: {advice}")
 
 
-def _tonemap_of(file, info, said, declared, exported, warnings):
+def _tonemap_of(file, info, facts, declared, exported, warnings):
     """Return the tonemap of the file's values: the declared one, that of its name, or the export's."""
     unnamed = str(exported.get("tonemap", "gamma")) if declared == "auto" else declared
-    name = said.get("tonemap") or unnamed
+    name = facts.get("tonemap") or unnamed
     if info["hdr"]:
-        if "tonemap" in said and name != "linear":
+        if "tonemap" in facts and name != "linear":
             warnings.append(f"{file}: says that it is under {name[:40]!a}; it is read as linear radiance")
         return unnamed
     if name not in TONEMAPS:
@@ -290,9 +268,7 @@ def _tonemap_of(file, info, said, declared, exported, warnings):
     return name
 
 
-def planes(
-    file: FilePath, pixels: np.ndarray, warnings: list[str]
-) -> tuple[np.ndarray, np.ndarray, int]:
+def planes(file: FilePath, pixels: np.ndarray, warnings: list[str]) -> tuple[np.ndarray, np.ndarray, int]:
     """Return values (h, w, 3) and alpha (h, w), float64, and the largest code; codes become [0, 1]."""
     top = 1 if pixels.dtype == np.float32 else int(np.iinfo(pixels.dtype).max)
     values = pixels.astype(np.float64) / top

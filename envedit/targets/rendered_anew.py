@@ -38,16 +38,9 @@ def is_rendered_anew(
 ) -> bool:
     """Say whether a picture was rendered under other light, and not painted.
 
-    Parameters
-    ----------
-    picture, painted_on : ndarray (h, w, 3)
-        The picture, and the rendering A that may have been painted on, linear radiance.
-    coverage : ndarray (h, w, 1)
-        Where the two differ.
-    another : callable
-        Returns B, the rendering of the same map with other samples; called only where it is needed.
-    views : sequence of slice
-        Rows of each view.
+    ``picture`` and ``painted_on``, A, are (h, w, 3) linear radiance, ``coverage`` (h, w, 1) where the two
+    differ. ``another`` returns B, the rendering of the same map with other samples, and is called only where
+    it is needed. ``views`` are the rows of each view.
     """
     lit = (painted_on > 0).any(axis=2)
     if not lit.any() or (coverage[lit] > 0).mean() < CHANGED:
@@ -74,17 +67,8 @@ def samples(
 ) -> int:
     """Return how many samples a pixel a picture of the scene seems to have been rendered with.
 
-    By its noise and that of a rendering of the same scene, as the variance falls as 1 / samples; from 1 to
-    :data:`MOST_SAMPLES`.
-
-    Parameters
-    ----------
-    picture, known : ndarray (h, w, 3), (h, w)
-        The picture and its :func:`noise`.
-    initial, spp : ndarray (h, w, 3), int
-        A rendering of the scene and its samples a pixel.
-    views : sequence of slice
-        Rows of each view.
+    By its noise (``known``, of :func:`noise`) and that of an ``initial`` rendering (h, w, 3) of the same
+    scene with ``spp`` samples, as the variance falls as 1 / samples; from 1 to :data:`MOST_SAMPLES`.
     """
     ratio = float(np.median(noise(initial, views))) / max(float(np.median(known)), 1e-6)
     return int(np.clip(round(spp * ratio**2), 1, MOST_SAMPLES))

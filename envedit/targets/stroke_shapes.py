@@ -27,22 +27,22 @@ def coverage(stroke: dict, height: int, width: int) -> np.ndarray:
     height, width : int
         Size of the picture in pixels.
     """
-    found = np.zeros((height, width))
+    covered = np.zeros((height, width))
     across, down = (width, height) if stroke["units"] == "fraction" else (1, 1)
     shape = _shape(stroke, np.array([across, down], np.float64), across)
     if shape is None:
-        return found[..., None] + 1
+        return covered[..., None] + 1
     distance, low, high = shape
     soft = stroke["softness"] * across
     margin = soft / 2 + 1
     x0, y0 = (int(v) for v in np.clip(np.floor(low - margin), 0, (width, height)))
     x1, y1 = (int(v) for v in np.clip(np.ceil(high + margin), 0, (width, height)))
     if x0 >= x1 or y0 >= y1:
-        return found[..., None]
+        return covered[..., None]
     y, x = np.mgrid[y0:y1, x0:x1] + 0.5
     centres = np.stack([x.ravel(), y.ravel()], axis=-1)
     d = distance(centres)
-    covered = _smooth_step(0.5 - d / max(soft, 1.0))
+    nearby = _smooth_step(0.5 - d / max(soft, 1.0))
     if soft < 8:
         crossed = np.flatnonzero(np.abs(d) < soft / 2 + 0.75)  # a pixel reaches 0.71 from its centre
         offsets = (np.arange(_SUBSAMPLES) + 0.5) / _SUBSAMPLES - 0.5
@@ -50,10 +50,10 @@ def coverage(stroke: dict, height: int, width: int) -> np.ndarray:
         for start in range(0, len(crossed), 1 << 14):
             part = crossed[start : start + (1 << 14)]
             d = distance((centres[part, None] + places).reshape(-1, 2)).reshape(len(part), -1)
-            covered[part] = _smooth_step(0.5 - d / max(soft, 1 / _SUBSAMPLES)).mean(axis=1)
-    covered[covered < _LEAST] = 0
-    found[y0:y1, x0:x1] = covered.reshape(y1 - y0, x1 - x0)
-    return found[..., None]
+            nearby[part] = _smooth_step(0.5 - d / max(soft, 1 / _SUBSAMPLES)).mean(axis=1)
+    nearby[nearby < _LEAST] = 0
+    covered[y0:y1, x0:x1] = nearby.reshape(y1 - y0, x1 - x0)
+    return covered[..., None]
 
 
 def _smooth_step(u):

@@ -36,12 +36,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from envedit.config.stroke_schema import StrokeList
 from envedit.core.color import inverse_tonemap, luminance, tonemap
-from envedit.core.errors import InputError, place_of
 from envedit.targets.stroke_shapes import coverage
 
 __all__ = ["Painted", "paint"]
@@ -51,22 +51,16 @@ _MOST = float(np.finfo(np.float32).max)
 
 @dataclass(frozen=True)
 class Painted:
-    """A picture after its strokes.
+    """A painted picture."""
 
-    Attributes
-    ----------
-    picture : ndarray (h, w, 3) float32
-        Linear radiance. Where coverage is 0 it is the picture given, bit for bit.
-    coverage : ndarray (h, w, 1) float32
-        In [0, 1], how much of a pixel lies under strokes, whatever their opacity (but not if that is 0):
-        1 - prod(1 - c).
-    warnings : tuple of str
-        Strokes that painted nothing, by name.
-    """
-
+    # (h, w, 3) float32, linear radiance. Where coverage is 0 it is the picture painted on, bit for bit
     picture: np.ndarray
+    # (h, w, 1) float32, in [0, 1], how much of a pixel was painted: under strokes, whatever their opacity
+    # (but not if that is 0), 1 - prod(1 - c)
     coverage: np.ndarray
-    warnings: tuple[str, ...] = ()
+    # bool (h, w), pixels of a file without information: clipped, or transparent over nothing; None: none
+    excluded: Any = None
+    warnings: tuple[str, ...] = ()  # what the user should know
 
 
 def paint(picture: np.ndarray, strokes: Sequence[dict], tonemap: str = "gamma") -> Painted:
@@ -85,10 +79,8 @@ def paint(picture: np.ndarray, strokes: Sequence[dict], tonemap: str = "gamma") 
     ------
     ConfigError
         If a stroke or the tonemap cannot be understood.
-    InputError
-        If the picture has another shape or a pixel that is not finite.
     """
-    image = _checked(picture)
+    image = np.asarray(picture, np.float32)
     display = Display(tonemap)
     height, width, _ = image.shape
     result = image.astype(np.float64)
@@ -113,21 +105,8 @@ def paint(picture: np.ndarray, strokes: Sequence[dict], tonemap: str = "gamma") 
         result = np.where(covered > 0, np.minimum(painted, _MOST), result)
         bare *= 1 - covered
     total = (1 - bare).astype(np.float32)
-    return Painted(np.where(total > 0, result.astype(np.float32), image), total, tuple(warnings))
-
-
-def _checked(picture):
-    """Return a picture in float32."""
-    image = np.asarray(picture)
-    if image.ndim != 3 or image.shape[2] != 3 or not image.size or image.dtype.kind not in "fiu":
-        raise InputError(
-            f"picture to paint on: got shape {image.shape} of {image.dtype}, expected (h, w, 3) numbers"
-        )
-    with np.errstate(over="ignore"):  # a float64 too large for float32 becomes inf, and is named below
-        image = image.astype(np.float32)
-    if (bad := ~np.isfinite(image)).any():
-        raise InputError(f"picture to paint on: pixel at {place_of(bad)} is not finite: repair it")
-    return image
+    picture = np.where(total > 0, result.astype(np.float32), image)
+    return Painted(picture, total, warnings=tuple(warnings))
 
 
 # ------------------------------------------------------------------------------------------------------------
@@ -271,17 +250,10 @@ def _blurred(values, sigma, axis):
 
 
 def membrane(values: np.ndarray, unknown: np.ndarray) -> np.ndarray:
-    """Replace pixels by the membrane through those around them: each is the mean of its neighbours.
+    """Replace ``unknown`` pixels (h, w) of a picture (h, w, C) by the membrane through those around them.
 
-    The discrete Laplace equation, with no flow across the picture's border, by conjugate gradients; to about
-    1e-6 of the largest value.
-
-    Parameters
-    ----------
-    values : ndarray (h, w, C) float64
-        The picture.
-    unknown : ndarray of bool (h, w)
-        Pixels to replace; not all.
+    Each is the mean of its neighbours: the discrete Laplace equation, with no flow across the picture's
+    border, by conjugate gradients; to about 1e-6 of the largest value. Some pixel must be known.
     """
     row, column = np.nonzero(unknown)
     height, width = unknown.shape

@@ -39,49 +39,27 @@ MOST_WHITE = 0.1
 
 @dataclass(frozen=True)
 class Target:
-    """The picture wanted.
+    """The picture wanted."""
 
-    Attributes
-    ----------
-    picture : ndarray (h, w, 3)
-        Linear radiance.
-    weight : ndarray (h, w, 1) or None
-        How much each pixel counts; None: all the same.
-    envmap : ndarray (H, W, 3) or None
-        The map that makes the picture, where it is known.
-    source : str
-        One line for the report.
-    warnings : tuple of str
-        What the user should know about the picture.
-    initial : ndarray (h, w, 3) or None
-        What was painted on: the rendering under the map as it is; None where nothing was painted.
-    coverage : ndarray (h, w, 1) or None
-        How much each pixel was painted; None likewise.
-    asked : tuple of ndarray
-        What the target was made from beside the configuration, for a checkpoint to know it by. Not the
-        rendering that was painted on: rendered anew, it may differ in its last bits.
-    noise : ndarray (h, w) or None
-        Standard error of the picture's display values; None where it is not known.
-    spp : int or None
-        Samples a pixel that the picture was rendered with; None where it was not rendered.
-    compared : ndarray (h, w, 3) or None
-        What the loop compares T E with, linear radiance; None: the picture. Usually the picture as T sees it
-        (:meth:`seen_as`).
-    photo : Photo or None
-        The photograph that the picture is, as far as its camera is known.
-    """
-
-    picture: np.ndarray
-    weight: np.ndarray | None
-    envmap: np.ndarray | None
-    source: str
-    warnings: tuple[str, ...] = ()
+    picture: np.ndarray  # (h, w, 3), linear radiance
+    weight: np.ndarray | None  # (h, w, 1), how much each pixel counts; None: all the same
+    envmap: np.ndarray | None  # (H, W, 3), the map that makes the picture, where it is known
+    source: str  # one line for the report
+    warnings: tuple[str, ...] = ()  # what the user should know about the picture
+    # (h, w, 3), what was painted on: the rendering under the map as it is; None where nothing was painted
     initial: np.ndarray | None = None
-    coverage: np.ndarray | None = None
+    coverage: np.ndarray | None = None  # (h, w, 1), how much each pixel was painted; None likewise
+    # What the target was made from beside the configuration, for a checkpoint to know it by. Not the
+    # rendering that was painted on: rendered anew, it may differ in its last bits
     asked: tuple[np.ndarray, ...] = ()
+    # (h, w), standard error of the picture's display values; None where it is not known
     noise: np.ndarray | None = None
+    # Samples a pixel that the picture was rendered with; None where it was not rendered
     spp: int | None = None
+    # (h, w, 3), what the loop compares T E with, linear radiance; None: the picture. Usually the picture as T
+    # sees it (:meth:`seen_as`)
     compared: np.ndarray | None = None
+    # The photograph that the picture is, as far as its camera is known
     photo: photographs.Photo | None = None
 
     @property
@@ -151,70 +129,75 @@ def make(
     ConfigError
         If a view is not the scene's, or is given twice; as of :func:`.extensions.load`.
     """
-    chosen, alpha = settings.target, scene.alpha
-    hidden = None if alpha is None else alpha == 0
-    named = picture is None and other is None and chosen.kind == "envmap" and chosen.file
-    if named and not images.is_panorama(str(chosen.file)):
-        settings = replace(settings, target=replace(chosen, kind="rendering"))
-        made = _of_rendering(settings, scene, envmap, None, None, " (it is not 2:1, as a map is)")
-        return _seen(made, hidden, settings.output.tonemap)
+    hidden = None if scene.alpha is None else scene.alpha == 0
+    made = _made(settings, scene, envmap, picture, mask, other, hidden)
+    return _seen(made, hidden, settings.output.tonemap)
+
+
+def _made(settings, scene, envmap, picture, mask, other, hidden):
+    """Make the target, without regard to pixels that see no surface where nothing was painted."""
+    # ---- The scene under another map
+    chosen = settings.target
     if picture is None and chosen.kind == "envmap":
-        return _seen(_rendered(settings, scene, envmap, other), hidden, settings.output.tonemap)
+        if other is not None or not chosen.file or images.is_panorama(str(chosen.file)):
+            return _rendered(settings, scene, envmap, other)
+        settings = replace(settings, target=replace(chosen, kind="rendering"))
+        return _of_rendering(settings, scene, envmap, None, None, " (it is not 2:1, as a map is)")
+
+    # ---- A picture of the scene under other light
     if chosen.kind == "photo":
-        return _seen(_of_photo(settings, scene, envmap, picture, mask), hidden, settings.output.tonemap)
+        return _of_photo(settings, scene, envmap, picture, mask)
     if chosen.kind not in config.TARGET_KINDS and picture is None:
         picture = extensions.load(extensions.TARGETS, chosen.kind)(settings, scene, envmap)
-        chosen = replace(chosen, kind="rendering")
+        return _of_rendering(settings, scene, envmap, picture, mask)
     if chosen.kind == "rendering":
         if picture is None and not chosen.file:  # an array may take its place
             raise ConfigError(
                 'target.file: got "", expected the picture of the scene, as target.kind is "rendering"'
             )
-        made = _of_rendering(settings, scene, envmap, picture, mask)
-        return _seen(made, hidden, settings.output.tonemap)
-    shape = scene.height, scene.width
+        return _of_rendering(settings, scene, envmap, picture, mask)
+
+    # ---- What was painted
     initial = initial_rendering.initial(scene, envmap, settings)
     asked: tuple[np.ndarray, ...] = ()
     if picture is not None:
-        found = painted_image.given(picture, shape, initial, mask)
+        painted = painted_image.given(picture, (scene.height, scene.width), initial, mask)
         source, asked = "painted: given as an array", (picture, *([] if mask is None else [mask]))
     elif chosen.kind == "image":
-        found = _painted_files(scene, initial, settings)
+        painted = _painted_files(scene, initial, settings)
         asked = tuple(np.fromfile(file, np.uint8) for file in (*chosen.files, *chosen.masks) if file)
         source = f"painted: {', '.join(chosen.files)}"
     else:
-        found = _painted_strokes(scene, initial, chosen)
+        painted = _painted_strokes(scene, initial, chosen)
         source = f"painted: {len(chosen.strokes)} strokes on the initial rendering"
     if chosen.kind == "image" and mask is None and not chosen.masks:
-        anew = rendered_anew.is_rendered_anew(
-            found.picture, initial, found.coverage, lambda: _again(scene, envmap, settings), scene.rows
-        )
-        if anew:
-            made = _of_rendering(settings, scene, envmap, picture, mask, FOUND_ANEW)
-            return _seen(made, hidden, settings.output.tonemap)
-    picture, warnings = found.picture, tuple(found.warnings)
+
+        def rendered_again():
+            spp, seed, cache = chosen.spp, Seeds.of(settings.seed).judged, settings.renderer.cache
+            return rendered(scene, envmap, spp, seed, cache)[0]
+
+        if rendered_anew.is_rendered_anew(
+            painted.picture, initial, painted.coverage, rendered_again, scene.rows
+        ):
+            return _of_rendering(settings, scene, envmap, picture, mask, FOUND_ANEW)
+    picture, warnings = painted.picture, painted.warnings
     if over := int((picture > BRIGHTEST).any(axis=2).sum()):
         # Squares and sums of what is more would leave single precision; on a display it is as white.
         picture = np.minimum(picture, np.float32(BRIGHTEST))
         warnings += (f"target: {over} pixels are brighter than {BRIGHTEST:.3g}: they count as that bright",)
-    coverage = found.coverage if hidden is None else np.where(hidden[..., None], 0, found.coverage)
-    if found.coverage.any() and not coverage.any():
+
+    # ---- How much each pixel counts
+    coverage = painted.coverage if hidden is None else np.where(hidden[..., None], 0, painted.coverage)
+    if painted.coverage.any() and not coverage.any():
         raise InputError(
             "target: all paint lies where no surface is seen (hide_emitters): paint on a surface"
         )
-    uncounted = found.excluded & (coverage[..., 0] > 0)  # what was not painted has the initial value
+    uncounted = painted.excluded & (coverage[..., 0] > 0)  # what was not painted has the initial value
     hold = first_hold(settings)
     weight = pixel_weight(coverage, uncounted if hidden is None else uncounted | hidden, chosen.paint, hold)
     share = 100 * float((coverage > 0).mean())
     source += f", {share:.3g} % of the pixels; weights {chosen.paint:g} (paint) and {hold:g} (the rest)"
-    made = Target(picture, weight, None, source, warnings, initial, coverage, asked)
-    return _seen(made, hidden, settings.output.tonemap)
-
-
-def _again(scene, envmap, settings):
-    """Render the map again as :func:`.initial_rendering.initial` does, with other samples."""
-    seed = Seeds.of(settings.seed).judged
-    return rendered(scene, envmap, settings.target.spp, seed, settings.renderer.cache)[0]
+    return Target(picture, weight, None, source, warnings, initial, coverage, asked)
 
 
 def _of_rendering(settings, scene, envmap, picture, mask, how=""):
@@ -223,7 +206,7 @@ def _of_rendering(settings, scene, envmap, picture, mask, how=""):
     chosen, shape = settings.target, (scene.height, scene.width)
     if picture is not None:
         everywhere = np.ones(shape) if mask is None else mask
-        found = painted_image.given(picture, shape, np.zeros((*shape, 3)), everywhere)
+        image = painted_image.given(picture, shape, np.zeros((*shape, 3)), everywhere)
         source = "a picture of the scene, given as an array"
         asked = (picture, *([] if mask is None else [mask]))
     else:
@@ -235,21 +218,21 @@ def _of_rendering(settings, scene, envmap, picture, mask, how=""):
             file, mask = by_view[k]
             return painted_image.read(file, before.shape[:2], chosen.tonemap, None, mask, unnamed)
 
-        found = _of_views(scene, np.zeros((*shape, 3), np.float32), by_view, of_view)
+        image = _of_views(scene, np.zeros((*shape, 3), np.float32), by_view, of_view)
         source = f"a picture of the scene: {', '.join(chosen.files)}"
         asked = tuple(np.fromfile(file, np.uint8) for file in (*chosen.files, *chosen.masks) if file)
 
     # ---- Pixels that count, and its noise
-    weight = np.where(found.excluded[..., None], 0, found.coverage).astype(np.float32)
+    weight = np.where(image.excluded[..., None], 0, image.coverage).astype(np.float32)
     if not weight.any():
         raise InputError("target: no pixel of the picture counts: all are clipped, masked or transparent")
     counts = None if (weight == 1).all() else weight
-    picture = np.minimum(found.picture, np.float32(BRIGHTEST))
+    picture = np.minimum(image.picture, np.float32(BRIGHTEST))
     noise = rendered_anew.noise(picture, scene.rows)
     initial, spp, _ = with_noise(settings, scene, envmap)
     spp = rendered_anew.samples(picture, noise, initial, spp, scene.rows)
     source += f"{how}, as noisy as {spp} samples a pixel"
-    return Target(picture, counts, None, source, tuple(found.warnings), asked=asked, noise=noise, spp=spp)
+    return Target(picture, counts, None, source, tuple(image.warnings), asked=asked, noise=noise, spp=spp)
 
 
 def _of_photo(settings, scene, envmap, picture, mask):
@@ -263,20 +246,20 @@ def _of_photo(settings, scene, envmap, picture, mask):
     outlines, _, _ = rendered(scene, everywhere, spp, Seeds.of(settings.seed).target_again, cache)
     file = chosen.files[0]
     mask_file = "".join(chosen.masks)
-    found, warnings = photographs.read(file, mask_file, outlines, chosen.align, chosen.vignetting)
+    photo, warnings = photographs.read(file, mask_file, outlines, chosen.align, chosen.vignetting)
 
     # ---- Its camera
     initial, spp, _ = with_noise(settings, scene, envmap)
-    curves = found.curves if chosen.curve == "auto" or found.curves == ("linear",) else (chosen.curve,)
+    curves = photo.curves if chosen.curve == "auto" or photo.curves == ("linear",) else (chosen.curve,)
     known = [None if value == "auto" else value for value in (chosen.exposure, chosen.white_balance)]
-    found = replace(found, curves=curves, stops=known[0], kelvin=known[1])
-    found = found.under(curves[0], initial, found.counts)
+    photo = replace(photo, curves=curves, stops=known[0], kelvin=known[1])
+    photo = photo.under(curves[0], initial, photo.counts)
     asked = tuple(np.fromfile(one, np.uint8) for one in (*chosen.files, *chosen.masks) if one)
-    placed = f", {found.placed.summary}" if found.placed.summary else ""
+    placed = f", {photo.placed.summary}" if photo.placed.summary else ""
     source = f"a photograph of the scene: {file}{placed}"
-    counts = None if (found.counts == 1).all() else found.counts
-    target = Target(found.picture, counts, None, source, tuple(warnings), asked=asked, photo=found)
-    target = target.developed(found)
+    counts = None if (photo.counts == 1).all() else photo.counts
+    target = Target(photo.picture, counts, None, source, tuple(warnings), asked=asked, photo=photo)
+    target = target.developed(photo)
 
     # ---- Its noise
     noise = rendered_anew.noise(target.picture, scene.rows)
@@ -284,12 +267,12 @@ def _of_photo(settings, scene, envmap, picture, mask):
     return replace(target, noise=noise, spp=spp)
 
 
-def _by_view(scene, views, given):
-    """Return what was given for each view, by the view's number."""
+def _by_view(scene, views, values):
+    """Return the value for each view, by the view's number."""
     numbers = [scene.view(view, "target.view") for view in views]
     if len(set(numbers)) < len(numbers):
         raise ConfigError("target.view: got a view by index and by name, expected each once")
-    return dict(zip(numbers, given, strict=True))
+    return dict(zip(numbers, values, strict=True))
 
 
 def _painted_files(scene, initial, settings):
@@ -317,12 +300,12 @@ def _painted_strokes(scene, initial, chosen):
         own = [i for i, number in enumerate(numbers) if number == k]
         made = strokes.paint(before, [chosen.strokes[i] for i in own], chosen.display_tonemap)
         warnings.extend(_renumbered(line, own) for line in made.warnings)
-        return painted_image.Painted(made.picture, made.coverage, np.zeros(before.shape[:2], bool), ())
+        return replace(made, excluded=np.zeros(before.shape[:2], bool), warnings=())
 
-    found = _of_views(scene, initial, numbers, of_view)
-    if not found.coverage.any():
+    painted = _of_views(scene, initial, numbers, of_view)
+    if not painted.coverage.any():
         raise InputError(f"target.strokes: {'; '.join(warnings) or 'none of them paints anything'}")
-    return replace(found, warnings=tuple(warnings))
+    return replace(painted, warnings=tuple(warnings))
 
 
 def _renumbered(line, own):
@@ -339,14 +322,13 @@ def _of_views(scene, initial, painted, of_view):
             parts.append(of_view(k, before))
         else:
             shape = before.shape[:2]
-            parts.append(painted_image.Painted(
-                before, np.zeros((*shape, 1), np.float32), np.zeros(shape, bool), ()
-            ))  # fmt: skip
+            bare = np.zeros((*shape, 1), np.float32)
+            parts.append(strokes.Painted(before, bare, np.zeros(shape, bool)))
     picture, coverage, excluded = (
         np.concatenate([getattr(p, name) for p in parts]) for name in ("picture", "coverage", "excluded")
     )
-    said = tuple(line for part in parts for line in part.warnings)
-    return painted_image.Painted(picture, coverage, excluded, said)
+    warnings = tuple(line for part in parts for line in part.warnings)
+    return strokes.Painted(picture, coverage, excluded, warnings)
 
 
 def _seen(target, hidden, curve):
@@ -358,9 +340,9 @@ def _seen(target, hidden, curve):
     counted = white if hidden is None else white & ~hidden
     share = counted.sum() / (white.size if hidden is None else max((~hidden).sum(), 1))
     if share > MOST_WHITE and target.photo is None:
-        said = f"target: {100 * share:.3g} % of its pixels are white under the tonemap '{curve}', where "
-        said += "measures and pictures show no difference: lower scene.scale, or set another output.tonemap"
-        target = replace(target, warnings=(*target.warnings, said))
+        line = f"target: {100 * share:.3g} % of its pixels are white under the tonemap '{curve}', where "
+        line += "measures and pictures show no difference: lower scene.scale, or set another output.tonemap"
+        target = replace(target, warnings=(*target.warnings, line))
     if hidden is None or not hidden.any():
         return target
     weight = np.ones((*hidden.shape, 1), np.float32) if target.weight is None else target.weight
@@ -399,31 +381,18 @@ def _rendered(settings, scene, envmap, other):
 def with_noise(
     settings: config.Config, scene: Scene, envmap: np.ndarray
 ) -> tuple[np.ndarray, int, np.ndarray]:
-    """Render a target.
+    """Render a target under a map (H, W, 3), with samples, seed and cache of the configuration.
 
-    Parameters
-    ----------
-    settings : config.Config
-        Samples, seed and cache.
-    scene : Scene
-        The scene.
-    envmap : ndarray (H, W, 3)
-        The map that it is rendered under.
-
-    Returns
-    -------
-    picture : ndarray (h, w, 3)
-        Linear radiance.
-    spp : int
-        Samples a pixel that were taken.
-    noise : ndarray (h, w)
-        Standard error of display values, RMS over channels; where it is not known from passes,
-        |d1 - d2| / sqrt(2), with d2 a second rendering with as many samples.
+    Returned are the picture (h, w, 3), linear radiance, the samples a pixel that were taken, and the standard
+    error (h, w) of display values, RMS over channels: where it is not known from passes, |d1 - d2| / sqrt(2),
+    with d2 a second rendering with as many samples.
     """
-    asked, seeds, keep = settings.target.spp, Seeds.of(settings.seed), settings.renderer.cache
-    picture, spp, noise = rendered(scene, envmap, asked, seeds.target, keep)
+    seeds = Seeds.of(settings.seed)
+    samples = settings.target.spp
+    keep = settings.renderer.cache
+    picture, spp, noise = rendered(scene, envmap, samples, seeds.target, keep)
     if noise is None:
-        again, _, _ = rendered(scene, envmap, asked, seeds.target_again, keep)
+        again, _, _ = rendered(scene, envmap, samples, seeds.target_again, keep)
         off = np.float64(apply_tonemap(picture)) - apply_tonemap(again)
         noise = np.sqrt(np.square(off).mean(axis=2) / 2)
     return picture, spp, noise

@@ -30,9 +30,9 @@ MUCH = 1.8
 
 def most_pixels(settings: config.Config) -> int | None:
     """Return the most pixels that an edit is solved on; None: as many as there are."""
-    asked = settings.renderer.pixels
-    if isinstance(asked, int):
-        return asked
+    pixels = settings.renderer.pixels
+    if isinstance(pixels, int):
+        return pixels
     chosen = settings.representation
     smooth = isinstance(chosen.cycles, str) or chosen.cycles <= CYCLES
     return PIXELS if smooth and settings.newton else None
@@ -46,8 +46,8 @@ def smaller(settings: config.Config, scene: Scene) -> Scene:
     most, pixels = most_pixels(settings), scene.width * scene.height
     if most is None or pixels <= MUCH * most:
         return scene
-    found = scaled(scene, (most / pixels) ** 0.5)
-    return found if found is not None and found.width * found.height < pixels else scene
+    small = scaled(scene, (most / pixels) ** 0.5)
+    return small if small is not None and small.width * small.height < pixels else scene
 
 
 def scaled(scene: Scene, factor: float) -> Scene | None:
@@ -62,21 +62,11 @@ def scaled(scene: Scene, factor: float) -> Scene | None:
 def worked_on(
     settings: config.Config, scene: Scene, small: Scene, envmap: np.ndarray, target: Target
 ) -> Target:
-    """Return the target (of ``scene``) as the picture of a smaller scene.
+    """Return the target of a scene as the picture of the ``small`` scene, the same on a smaller film.
 
     It is rendered anew, so that the film's filter is the same as in what it is compared with. What was
-    painted is the change of each pixel, averaged over its area and added to the smaller initial rendering.
-
-    Parameters
-    ----------
-    settings : config.Config
-        Of the run.
-    scene, small : Scene
-        The scene, and it on a smaller film.
-    envmap : ndarray (H, W, 3)
-        The map that is edited.
-    target : Target
-        What was asked for.
+    painted is the change of each pixel, averaged over its area and added to the smaller initial rendering,
+    under ``envmap`` (H, W, 3), the map that is edited.
     """
     chosen = settings.target
     hidden = np.zeros((small.height, small.width), bool) if small.alpha is None else small.alpha == 0

@@ -25,48 +25,25 @@ BLOCKS = 32
 
 @dataclass(frozen=True)
 class Overview:
-    """T between blocks and cells.
+    """T between blocks and cells."""
 
-    Attributes
-    ----------
-    matrix : ndarray (3, blocks, cells) float32
-        Mean over the pixels of a block, for a radiance of 1 in all texels of a cell.
-    block_of : ndarray of int64 (h * w,)
-        Block of every pixel.
-    cell_of : ndarray of int64 (H * W,)
-        Cell of every texel.
-    directions : ndarray (cells, 3)
-        Unit vectors to the cells' centres.
-    omega : ndarray (cells,)
-        Solid angle of each cell, as a rendering receives it.
-    """
-
+    # (3, blocks, cells) float32, mean over the pixels of a block, for a radiance of 1 in all texels of a cell
     matrix: np.ndarray
-    block_of: np.ndarray
-    cell_of: np.ndarray
-    directions: np.ndarray
-    omega: np.ndarray
+    block_of: np.ndarray  # (h * w,), block of every pixel
+    cell_of: np.ndarray  # (H * W,), cell of every texel
+    directions: np.ndarray  # (cells, 3), unit vectors to the cells' centres
+    omega: np.ndarray  # (cells,), solid angle of each cell, as a rendering receives it
 
     def to_blocks(self, picture: np.ndarray) -> np.ndarray:
         """Average a picture (h, w, c) over blocks: (blocks, c)."""
         return _means(picture.reshape(-1, picture.shape[2]), self.block_of, np.ones(len(self.block_of)))
 
-    def to_cells(self, values: np.ndarray, weight: np.ndarray) -> np.ndarray:
-        """Average a map (H * W, c) over cells, weighted: (cells, c)."""
-        return _means(values, self.cell_of, weight)
-
 
 def make(matrix: ColourMatrix, shape: tuple[int, int], grid: tuple[int, int], views: Views = ()) -> Overview:
-    """Sum up the entries of a transport.
+    """Sum up the entries of a transport, pixels by texels.
 
-    Parameters
-    ----------
-    matrix : sparse_matrix.ColourMatrix
-        T, pixels by texels.
-    shape, grid : (int, int)
-        Height and width of the picture and of the map.
-    views : sequence of slice
-        Rows of each view, where the picture is of several: no block is of two.
+    ``shape`` and ``grid`` are height and width of the picture and of the map, ``views`` the rows of each
+    view, where the picture is of several: no block is of two.
     """
     block_of, blocks = _blocks(shape, views)
     cell_of, cells = tiles(*grid, max(1, -(-grid[1] // CELLS)))

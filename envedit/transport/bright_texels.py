@@ -10,21 +10,10 @@ import numpy as np
 
 
 def error(radiance: np.ndarray, omega: np.ndarray, samples: float, rest: np.ndarray) -> float:
-    """Predict the error of the samples when only the texels ``rest`` are left to them.
+    """Predict the error of some ``samples`` when only the texels ``rest``, bool (n,), are left to them.
 
-    Parameters
-    ----------
-    radiance, omega : ndarray (n,)
-        Radiance and solid angle of every texel.
-    samples : float
-        Number of samples.
-    rest : ndarray of bool (n,)
-        Texels left to the samples; the others are rendered without error.
-
-    Returns
-    -------
-    float
-        Error relative to the light of all texels; 0 where there is none.
+    ``radiance`` and ``omega`` (n,) are radiance and solid angle of every texel; those not in ``rest`` are
+    rendered without error. Relative to the light of all texels; 0 where there is none.
     """
     total = (radiance * omega).sum()
     e = radiance[rest]

@@ -238,12 +238,7 @@ class ExactColumns:
     def product(self, packets: mi.Float, count: int = 1) -> list[mi.Color3f]:
         """Multiply with maps: sum over columns of column * E[texel], of each map one colour a pixel.
 
-        Parameters
-        ----------
-        packets : Float
-            The maps, as :func:`.sparse_matrix.to_packets` interleaves them.
-        count : int
-            How many there are.
+        ``packets`` are ``count`` maps, as :func:`.sparse_matrix.to_packets` interleaves them.
         """
         return _product(self._store, packets, self._texel_of, self._count, self.pixels, self.capacity, count)
 
@@ -259,12 +254,8 @@ class ExactColumns:
     def add_adjoint(self, flat: mi.Float, packets: mi.Float) -> None:
         """Put the adjoint, the sum over pixels of column * I, in the places of the texels that have a column.
 
-        Parameters
-        ----------
-        flat : Float
-            The map that is being pulled back to, H * W * 3; its values at the columns' texels are replaced.
-        packets : Float
-            The picture, 4 floats a pixel, (r, g, b, unused), flat.
+        ``flat``, H * W * 3, is the map that is being pulled back to; ``packets`` the picture, 4 floats a
+        pixel, (r, g, b, unused), flat.
         """
         if not self.capacity:
             return

@@ -28,43 +28,29 @@ _SHADING = mi.BSDFFlags.Smooth
 
 @dataclass
 class Block:
-    """The paths of some pixels: vertices sorted by pixel, then bounce, then path; and escapes.
+    """The paths of some pixels: vertices sorted by pixel, then bounce, then path; and escapes."""
 
-    Attributes
-    ----------
-    first, pixels : int
-        First pixel, and how many.
-    vertices, escapes : int
-        How many there are.
-    hits : tuple of arrays (vertices,)
-        Origin, direction and time of rays; distance, coordinates, primitive, shape and instance that they
-        meet: what surface interactions are computed from again.
-    throughput, bounce, path, pixel : arrays (vertices,)
-        As of :class:`.camera_paths.Vertex`; ``pixel`` counts from the picture's first.
-    start : UInt32 (pixels + 1,)
-        First vertex of each pixel.
-    texels, shares : tuples of four UInt32, Float (escapes,)
-        Texels around the direction of an escape, and their shares.
-    light : tuple of three Float (escapes,)
-        What an escape adds for a radiance of 1.
-    at : UInt32 (escapes,)
-        Its pixel, from the picture's first.
-    """
-
+    # first, pixels: first pixel, and how many
     first: int
     pixels: int
+    # vertices, escapes: how many there are
     vertices: int = 0
     escapes: int = 0
+    # (vertices,), origin, direction and time of rays; distance, coordinates, primitive, shape and instance
+    # that they meet: what surface interactions are computed from again
     hits: tuple | None = None
+    # throughput, bounce, path, pixel: (vertices,), as of :class:`.camera_paths.Vertex`; ``pixel`` counts from
+    # the picture's first
     throughput: mi.Color3f | None = None
     bounce: mi.UInt32 | None = None
     path: mi.UInt32 | None = None
     pixel: mi.UInt32 | None = None
-    start: mi.UInt32 | None = None
+    start: mi.UInt32 | None = None  # (pixels + 1,), first vertex of each pixel
+    # texels, shares: (escapes,), texels around the direction of an escape, and their shares
     texels: tuple[mi.UInt32, ...] = ()
     shares: tuple[mi.Float, ...] = ()
-    light: tuple[mi.Float, ...] = ()
-    at: mi.UInt32 | None = None
+    light: tuple[mi.Float, ...] = ()  # (escapes,), what an escape adds for a radiance of 1
+    at: mi.UInt32 | None = None  # (escapes,), its pixel, from the picture's first
 
     @property
     def bytes(self) -> int:
@@ -75,14 +61,8 @@ class Block:
 def blocks(scene: mi.Scene, grid: Grid, pixels: int, count: int, bounces: int, seed: int) -> Iterator[Block]:
     """Trace the paths of a picture; yields a :class:`Block` for every few pixels.
 
-    Parameters
-    ----------
-    scene, bounces, seed
-        As of :func:`.camera_paths.trace`.
-    grid : Grid
-        Texels that escaping rays are recorded by.
-    pixels, count : int
-        Pixels of the picture, and camera paths a pixel.
+    ``pixels`` are those of the picture, ``count`` the camera paths of each; escaping rays are recorded by the
+    texels of ``grid``. Other parameters are as of :func:`.camera_paths.trace`.
     """
     size = max(SLICE, LANES // count // SLICE * SLICE)
     for first in range(0, pixels, size):

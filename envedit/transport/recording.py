@@ -162,16 +162,9 @@ def record(scene: mi.Scene, grid: Grid, pixels: np.ndarray, spp: int, bounces: i
 def record_all(
     scene: Scene, grid: Grid, spp: int, bounces: int, seed: int, progress: Progress | None = None
 ) -> Recorded:
-    """Record every pixel of a scene's film, block by block.
+    """Record every pixel of a scene's film, block by block; other parameters are as in :func:`contributions`.
 
-    Parameters
-    ----------
-    scene : envedit.scene.Scene
-        Scene, camera and film.
-    grid, spp, bounces, seed
-        As in :func:`contributions`.
-    progress : callable, optional
-        Called with (done, total) blocks.
+    ``progress`` is called with (done, total) blocks.
     """
     pixels = scene.width * scene.height
     block = max(1, LANES // spp)
@@ -225,28 +218,15 @@ def enough_bounces(by_bounce: np.ndarray) -> int:
 
 
 def choose_bounces(scene: Scene, max_depth: int | str, by_bounce: np.ndarray) -> tuple[int, list[str]]:
-    """Choose the surface points along a path from the light by bounce that :func:`pilot` found.
+    """Choose the surface points along a path from the light by bounce (n,) that :func:`pilot` found.
 
-    Parameters
-    ----------
-    scene : envedit.scene.Scene
-        Named in the error.
-    max_depth : int or "auto"
-        Mitsuba's path depth; taken as it is if it is a number.
-    by_bounce : ndarray (n,)
-        Light by bounce.
-
-    Returns
-    -------
-    bounces : int
-        Path depth - 1.
-    choices : list of str
-        What to report about an automatic choice.
+    ``max_depth`` is Mitsuba's path depth, taken as it is if it is a number, or "auto". Returned are the
+    bounces, path depth - 1, and what to report about an automatic choice.
 
     Raises
     ------
     InputError
-        If no light arrives within that depth.
+        If no light arrives within that depth; it names the scene.
     """
     automatic = max_depth == "auto"
     most = MAX_BOUNCES + 1 if automatic else max_depth
@@ -265,26 +245,11 @@ def choose_bounces(scene: Scene, max_depth: int | str, by_bounce: np.ndarray) ->
 
 
 def choose_samples(scene: Scene, spp: int | str, texels: int, memory_gb: float) -> tuple[int, int, str]:
-    """Choose how many samples and exact columns fit into the memory allowed.
+    """Choose how many samples and exact columns fit into the memory allowed, GB, for the film of a scene.
 
-    Parameters
-    ----------
-    scene : envedit.scene.Scene
-        Whose film counts.
-    spp : int or "auto"
-        Paths a pixel; taken as it is if it is a number, else :data:`PATHS` over the pixels, or
-        :func:`most_samples` if those are fewer.
-    texels : int
-        Texels of the map: no more columns are of use.
-    memory_gb : float
-        Memory allowed, GB.
-
-    Returns
-    -------
-    spp, capacity : int
-        Paths a pixel, and most exact columns.
-    choice : str
-        What to report to the user.
+    ``spp``, paths a pixel, is taken as it is if it is a number; "auto" is :data:`PATHS` over the pixels, or
+    :func:`most_samples` if those are fewer. More columns than the map has ``texels`` are of no use. Returned
+    are paths a pixel, most exact columns, and what to report to the user.
 
     Raises
     ------
@@ -336,14 +301,8 @@ def _automatic_spp(pixels):
 def row_mass(sphere: np.ndarray, by_row: np.ndarray) -> np.ndarray:
     """Share samples out among the rows of a map, (H,): solid angle * sqrt(light per solid angle).
 
-    There is a floor: rows that hardly matter to this view get few samples, but never none.
-
-    Parameters
-    ----------
-    sphere : ndarray (H,)
-        Solid angle of a texel of each row, steradians.
-    by_row : ndarray (H,)
-        Light by row, from :func:`pilot`.
+    ``sphere`` (H,) is the solid angle of a texel of each row, steradians, ``by_row`` (H,) light by row, from
+    :func:`pilot`. There is a floor: rows that hardly matter to this view get few samples, but never none.
     """
     floor = 0.05 * by_row.max()
     mass = sphere * np.clip(by_row / np.maximum(sphere, 1e-12), floor / sphere.max(), None) ** 0.5

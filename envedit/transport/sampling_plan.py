@@ -37,29 +37,18 @@ class SamplingPlan:
     """How T is sampled; made by :func:`choose`.
 
     Other attributes are those of :class:`.LightTransport`.
-
-    Attributes
-    ----------
-    mass : ndarray (H,)
-        Share of the samples by row of the map, up to a factor.
-    lamps : int
-        Path depth of the light of other lamps; 0: there are none; -1: any.
-    paths_bytes : int
-        Memory for camera paths that are kept for further columns.
-    choices : tuple of str
-        What was chosen automatically, with the measurement that decided.
     """
 
     spp: int
     bounces: int
     capacity: int
-    mass: np.ndarray
-    lamps: int
+    mass: np.ndarray  # (H,), share of the samples by row of the map, up to a factor
+    lamps: int  # path depth of the light of other lamps; 0: there are none; -1: any
     depth_error: float
     paths: tuple[int, int, int]
     tolerance: float
-    paths_bytes: int
-    choices: tuple[str, ...]
+    paths_bytes: int  # memory for camera paths that are kept for further columns
+    choices: tuple[str, ...]  # what was chosen automatically, with the measurement that decided
     warnings: tuple[str, ...]
 
     def key(self) -> dict[str, Any]:
@@ -97,20 +86,9 @@ def choose(
     memory_gb: float,
     few: bool = False,
 ) -> SamplingPlan:
-    """Choose how T is sampled.
+    """Choose how T of a scene is sampled, for maps of ``shape`` (H, W).
 
-    Parameters
-    ----------
-    scene : Scene
-        Scene, camera and film.
-    shape : (int, int)
-        Rows and columns of the map.
-    light : (ndarray (H,), ndarray (n,))
-        Of :func:`white_sky`.
-    spp, max_depth, few
-        As of :meth:`.LightTransport.build`.
-    memory_gb : float
-        Memory allowed, GB.
+    ``light`` is of :func:`white_sky`; other parameters are those of :meth:`.LightTransport.build`.
 
     Raises
     ------

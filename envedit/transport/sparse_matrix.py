@@ -232,23 +232,10 @@ def scale_packets(packets: mi.Float, scale: mi.Float, size: int, count: int = 1)
 def merge(
     rows: np.ndarray, columns: np.ndarray, weights: np.ndarray, width: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Sum entries that share row and column.
+    """Sum entries that share row and column of a matrix of so many columns, its ``width``.
 
-    Parameters
-    ----------
-    rows, columns : ndarray of integers (n,)
-        Places of the entries.
-    weights : ndarray (n, 3)
-        Their RGB weights.
-    width : int
-        Number of columns.
-
-    Returns
-    -------
-    rows, columns : ndarray of uint32 (m,)
-        Distinct places, ordered by row, then column.
-    weights : ndarray of float32 (m, 3)
-        Sums, accumulated in float64.
+    Rows, columns (n,) and RGB weights (n, 3) in any order become distinct places (m,), uint32, ordered by
+    row, then column, and sums (m, 3) float32, accumulated in float64.
     """
     key = rows.astype(np.int64) * width + columns
     order = np.argsort(key)

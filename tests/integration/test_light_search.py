@@ -155,13 +155,6 @@ def test_a_light_that_the_map_does_not_have_is_added(transport):
     np.testing.assert_allclose(extra, 10, rtol=0.3)
 
 
-@pytest.mark.slow
-def test_nothing_is_added_to_a_sky_that_is_right(transport):
-    found = Found(transport("mirror"), sky(), picture(transport("mirror"), sky()))
-    assert not found.lit
-    np.testing.assert_allclose(found.decoded, sky()[:ROWS], rtol=0.02)
-
-
 # ---- pictures that say little ----------------------------------------------------------------------------
 
 
@@ -192,12 +185,3 @@ def test_a_black_picture_makes_a_dark_sky(transport):
 @pytest.mark.slow
 def test_a_sun_below_the_rows_that_may_change_is_no_light_to_move(transport):
     assert Found(transport(), sky((20, 7)), picture(transport(), sky())).own == 0
-
-
-@pytest.mark.slow
-def test_the_same_question_has_the_same_answer_to_the_bit(transport, moved):
-    wanted, first = moved
-    again = Found(transport(), sky(SUN), wanted)
-    assert first.name == again.name and first.decoded.tobytes() == again.decoded.tobytes()
-    for name in first.state:
-        assert first.state[name].tobytes() == again.state[name].tobytes(), name

@@ -20,7 +20,7 @@ from envedit.solve import checkpoint, gauss_newton, light_places, map_problem, s
 from envedit.solve.adam_loop import State
 from envedit.solve.derivatives import NARROW_ANGLE
 from envedit.solve.gauss_newton import Run, solve
-from envedit.solve.likelihood import INDEPENDENT, Likelihood, on_average_one
+from envedit.solve.likelihood import Likelihood, on_average_one
 from envedit.solve.map_problem import Problem
 from envedit.solve.prior import PHOTOGRAPHED, Prior, of_paint
 from envedit.targets.pixel_weights import pixel_weight
@@ -185,7 +185,7 @@ def assert_gradient(problem, start, state, sigma, of_prior=True, normal=None):
 
     def f(x):
         penalty = problem.penalty(x, start) if of_prior else 0.0
-        return problem.misfit(problem.evaluate(x).residual, sigma) + penalty
+        return problem.likelihood.misfit(problem.evaluate(x).residual, sigma) + penalty
 
     for kind in kinds:
         h = STEPS[kind]
@@ -283,7 +283,7 @@ def test_texture_within_a_block_is_in_the_derivatives(rng):
         return [problem.evaluate(moved(problem, state, normal.unknowns, k, sign * h)) for sign in (1, -1)]
 
     def f(end):
-        return problem.misfit(end.residual, sigma) + problem.penalty(end.state, start)
+        return problem.likelihood.misfit(end.residual, sigma) + problem.penalty(end.state, start)
 
     some = list(range(0, 3 * n, 7))
     slope = np.array([f(ahead) - f(back) for ahead, back in map(ends, some)]) / (4 * h)
@@ -332,41 +332,6 @@ def test_state_and_params_are_inverse(case):
 
 
 # ---- F -----------------------------------------------------------------------------------------------------
-
-
-def huber(size, sigma):
-    return size**2 if size <= sigma else sigma * (2 * size - sigma)
-
-
-@pytest.mark.parametrize("sigma", [0.01, 0.3])
-def test_misfit_is_hubers_loss_of_a_pixel(case, sigma, rng):
-    problem, *_ = case
-    residual = rng.normal(0, 0.2, (*FILM, 3))
-    size = np.sqrt((residual**2).mean(axis=2))
-    weight = problem.likelihood.weight.ravel()
-    total = sum(w * huber(s, sigma) for w, s in zip(weight, size.ravel(), strict=True))
-    assert problem.misfit(residual, sigma) == pytest.approx(3 * total / sigma**2, rel=1e-6)
-    assert problem.misfit(0 * residual, sigma) == 0
-
-
-def test_misfit_is_continuous_with_its_slope_at_the_threshold(case):
-    problem, *_ = case
-    sigma, h = 0.1, 1e-4
-    before, at, after = (problem.misfit(np.full((*FILM, 3), sigma + d), sigma) for d in (-h, 0, h))
-    assert at == pytest.approx(3 * problem.likelihood.weight.sum(), rel=1e-6)
-    slopes = (at - before) / h, (after - at) / h
-    assert slopes[0] == pytest.approx(slopes[1], rel=2 * h / sigma)
-    far = [problem.misfit(np.full((*FILM, 3), k), sigma) for k in (1.0, 2.0, 3.0)]
-    assert far[2] - far[1] == pytest.approx(far[1] - far[0], rel=1e-9)  # linear
-
-
-def test_large_pictures_have_no_more_independent_pixels(rng):
-    image, transport = clouds(rng), DenseTransport.random(rng, (24, 32), GRID)
-    problem, params = problem_of(image, transport, 2 * shown(transport, image))
-    residual = problem.evaluate(problem.state(params)).residual
-    size = np.sqrt((residual**2).mean(axis=2))
-    sums = 3 * sum(huber(s, 0.1) for s in size.ravel()) / 0.1**2
-    assert problem.misfit(residual, 0.1) == pytest.approx(sums * 256 / (24 * 32), rel=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -545,17 +510,6 @@ def test_deviation_shrinks_with_what_is_known(rng):
     assert target.any()
 
 
-@pytest.mark.slow
-def test_deviation_does_not_exceed_the_priors_at_the_default_gain(rng):
-    image, transport = clouds(rng), DenseTransport.random(rng, (24, 24), GRID, even=0.8)
-    problem, params = problem_of(image, transport, shown(transport, image), cycles=12)
-    start = problem.state(params)
-    normal = problem.normal(problem.evaluate(start), start, map_problem.SIGMA)
-    deviation = problem.posterior(start, normal).deviation
-    assert np.isfinite(deviation).all() and (deviation > 0).all()
-    assert (deviation <= prior_deviation(problem) * (1 + 1e-4)).all()
-
-
 # ---- steps -------------------------------------------------------------------------------------------------
 
 
@@ -572,9 +526,11 @@ def followed(problem, params, **options):
     before, scale = problem.evaluate(start), np.inf
     sigma = options.get("sigma", map_problem.SIGMA)
     for row, point in zip(solution.history, points, strict=False):
-        f = problem.misfit(point.residual, row["sigma"]) + problem.penalty(point.state, start)
+        f = problem.likelihood.misfit(point.residual, row["sigma"]) + problem.penalty(point.state, start)
         assert f == pytest.approx(row["loss"], rel=1e-9) == row["data"] + row["prior"]
-        earlier = problem.misfit(before.residual, row["sigma"]) + problem.penalty(before.state, start)
+        earlier = problem.likelihood.misfit(before.residual, row["sigma"]) + problem.penalty(
+            before.state, start
+        )
         assert f < earlier
         assert sigma <= row["sigma"] <= max(scale, sigma)
         before, scale = point, row["sigma"]
@@ -614,20 +570,9 @@ def test_scale_is_that_of_the_residual_and_falls_by_half_at_most(case):
     solution, last = followed(problem, params, sigma=0.05, iterations=30)
     scales = [row["sigma"] for row in solution.history]
     residual = problem.evaluate(start).residual
-    assert scales[0] == problem.noise(residual, 0.05)
+    assert scales[0] == problem.likelihood.noise(residual, 0.05)
     assert all(b >= a / 2 * (1 - 1e-12) for a, b in zip(scales, scales[1:], strict=False))
-    assert scales[-1] == pytest.approx(problem.noise(last.residual, 0.05), rel=0.02)
-
-
-def test_noise_is_under_which_residuals_have_the_misfit_of_independent_ones(case, rng):
-    """Of Gaussian residuals their own deviation, nearly: Huber's loss counts large ones less."""
-    problem = case[0]
-    residual = rng.normal(0, 0.03, (*FILM, 3))
-    found = problem.noise(residual, 1e-3)
-    assert problem.misfit(residual, found) == pytest.approx(3 * INDEPENDENT, rel=1e-6)
-    assert problem.noise(residual, 0.5) == 0.5  # never below what is known
-    assert problem.noise(np.zeros((*FILM, 3)), 1e-3) == 1e-3
-    assert problem.noise(4 * residual, 1e-3) == pytest.approx(4 * found)
+    assert scales[-1] == pytest.approx(problem.likelihood.noise(last.residual, 0.05), rel=0.02)
 
 
 def test_a_step_that_raises_f_is_damped(case, monkeypatch):
@@ -658,7 +603,7 @@ def test_damping_is_not_taken_to_other_derivatives(case, monkeypatch):
 
     monkeypatch.setattr(Problem, "step", nowhere)
     point = problem.evaluate(state)
-    run = Run(state, start, scale=problem.noise(point.residual, 0.1))
+    run = Run(state, start, scale=problem.likelihood.noise(point.residual, 0.1))
     gauss_newton.descended(problem, run, point, 0.1, steps=2)
     assert run.finished and dampings.count(Run.damping) == 2 and max(dampings) >= 10
 
@@ -1114,7 +1059,7 @@ def test_gradient_where_rows_below_the_horizon_follow(horizon, rng):
     names = names_of(problem, normal)
 
     def f(x):
-        return problem.misfit(problem.evaluate(x).residual, 1.0) + problem.penalty(x, start)
+        return problem.likelihood.misfit(problem.evaluate(x).residual, 1.0) + problem.penalty(x, start)
 
     n, grids = problem.nodes, sum(rows * columns for rows, columns in problem.sizes)
     assert n == grids + (horizon == "keep") and ("ground" in params) == (horizon == "keep")
@@ -1144,7 +1089,7 @@ def test_gradient_by_the_sky_is_exact_where_a_block_is_not(rng):
     assert problem.blocks.count == 8 * 64 // 4
 
     def f(x):
-        return problem.misfit(problem.evaluate(x).residual, sigma)
+        return problem.likelihood.misfit(problem.evaluate(x).residual, sigma)
 
     some = range(0, 3 * problem.nodes, 5)
     ends = [[f(moved(problem, state, [], k, s * STEPS["gain"])) for s in (1, -1)] for k in some]
@@ -1218,25 +1163,6 @@ def test_saturation_comes_back_from_a_checkpoint_of_its_state(rng):
 
 
 # ---- pixels that do not count -----------------------------------------------------------------------------
-
-
-def test_pixels_that_count_are_the_whole_picture(rng):
-    """Where a mask takes nine tenths of the picture away, the noise is that of the rest."""
-    image, transport = clouds(rng), DenseTransport.random(rng, FILM, GRID)
-    mask = np.zeros((*FILM, 1), np.float32)
-    mask[: max(1, FILM[0] // 10)] = 0.5
-    residual = 0.03 * rng.normal(size=(*FILM, 3))
-    counted = Likelihood(on_average_one(mask, FILM))
-    problem, params = problem_of(image, transport, shown(transport, image), counted)
-    of_all, _ = problem_of(image, transport, shown(transport, image))
-    inside = np.where(mask > 0, residual, 0)
-    assert problem.likelihood.weight.mean() == pytest.approx(1)
-    assert of_all.noise(residual, 0.001) == pytest.approx(problem.noise(inside, 0.001), rel=0.3)
-    point = problem.evaluate(problem.state(params))
-    again = Likelihood(on_average_one(7 * mask, FILM))
-    aimed = problem.aimed_at(shown(transport, image), again, point)
-    assert problem.likelihood is again and aimed.residual.shape == residual.shape
-    assert problem.noise(inside, 0.001) == pytest.approx(counted.noise(inside, 0.001), rel=1e-6)
 
 
 def test_problems_of_one_job_share_their_blocks_and_nothing_else(rng):

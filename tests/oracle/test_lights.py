@@ -144,21 +144,6 @@ def test_rotate_is_the_rotation_matrix(angle, rng):
         np.testing.assert_array_equal(got, d.astype(np.float32))
 
 
-@pytest.mark.parametrize("angle", [0, 1e-8, 1e-3, 0.7, math.pi])
-def test_gradient_of_rotate(angle, rng):
-    """At zero it is the cross product; elsewhere that of the matrix, by central differences."""
-    d, weight = unit(rng), rng.normal(size=3)
-    start = unit(rng) * angle
-    v = mi.Vector3f(start)
-    dr.enable_grad(v)
-    dr.backward(dr.dot(lights.rotate(v, mi.Vector3f(d)), mi.Vector3f(weight)))
-    h, got = 1e-6, dr.grad(v).numpy().ravel()
-    steps = [(turned(start + h * e, d[None]) - turned(start - h * e, d[None])) @ weight for e in np.eye(3)]
-    np.testing.assert_allclose(got, np.ravel(steps) / (2 * h), atol=1e-5)
-    if angle == 0:
-        np.testing.assert_allclose(got, np.cross(d, weight), atol=1e-6)
-
-
 angles = st.tuples(st.floats(-math.pi, math.pi), st.floats(-math.pi / 2, math.pi / 2))
 
 
@@ -290,17 +275,6 @@ def test_light_of_rows_of_a_map_is_that_of_the_map(rng):
     turn = random_turn(rng)
     whole, of_rows = (core(Lights([x], (f, H), W), turn=turn) for x, f in ((light, 0), (part, 5)))
     np.testing.assert_array_equal(whole, of_rows)
-
-
-def test_lights_add_up(rng):
-    both = [patch(rng, 4, 10), patch(rng, 15, 40, peak=1.0)]
-    turn, flux, size = rng.normal(size=(2, 3)), rng.normal(size=(2, 3)), rng.normal(size=(2, 1)) * 0.3
-    got = core(Lights(both, (0, H), W), turn=turn, flux=flux, size=size)
-    alone = [
-        core(Lights([x], (0, H), W), turn=turn[i], flux=flux[i], size=size[i]) for i, x in enumerate(both)
-    ]
-    np.testing.assert_allclose(got, sum(alone), rtol=1e-5, atol=1e-6)
-    assert all(a.any() for a in alone)
 
 
 def test_a_spare_light_can_have_a_colour_that_no_light_has(rng):
@@ -446,47 +420,6 @@ def test_gradient_is_the_finite_difference(kind, top, rng):
         np.testing.assert_allclose(got, (ahead + behind) / 2, atol=2e-3 * scale)
         assert all(np.abs(g[1:]).max() < 1e-9 * scale for g in grads)  # spare lights are dark
     assert seen >= 8
-
-
-def path(start, end, count):
-    """Turns along a straight line between two rotation vectors, at the middles of equal steps."""
-    return start + (end - start) * ((np.arange(count) + 0.5) / count)[:, None]
-
-
-def over(light, name):
-    """Ends of paths for a light: (start, end)."""
-    east = np.cross(light.direction, UP)
-    east /= np.linalg.norm(east)
-    polar = math.acos(light.direction[1])  # angle to the zenith
-    return {
-        "texel borders": (np.zeros(3), np.array([0.6, 0.8, -0.1])),
-        "seam": (np.array([0, -0.4, 0.01]), np.array([0, 0.5, 0.02])),
-        "over the pole": (east * (polar - 0.8), east * (polar + 0.3)),
-        "past the pole": (east * (polar - 0.8) + [0.03, 0, 0.02], east * (polar + 0.3) + [0.03, 0, 0.02]),
-        "over the nadir": (-east * (math.pi - polar - 0.2), -east * (math.pi - polar + 0.7)),
-        "half a turn": (np.array([0, 2.5, 0.1]), np.array([0.3, 3.9, 0.1])),
-    }[name]
-
-
-PATHS = ["texel borders", "seam", "over the pole", "past the pole", "over the nadir", "half a turn"]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", PATHS)
-@pytest.mark.parametrize("top", [3, 11])
-@pytest.mark.parametrize("by", ["radiance", "flux"])
-def test_gradient_along_a_path_adds_up_to_the_change(name, top, by, rng):
-    """Many copies of a light, one at every step of the path: a linear loss is the sum of theirs."""
-    light, count = patch(rng, top, 46), 1000
-    start, end = over(light, name)
-    weight = weights() * (latlong.lookup_solid_angles(H, W)[:, None, None] if by == "flux" else 1)
-    at = place(made := Lights([light] * count, (0, H), W), turn=path(start, end, count))
-    (turn, _, _), _ = derivatives(lambda *p: weighted(made.core(*p, (H, W), (0, H)), weight), *at)
-    slopes = turn[:count] @ (end - start)
-    alone = Lights([light], (0, H), W)
-    low, high = ((core(alone, turn=v) * weight).sum() for v in (start, end))
-    np.testing.assert_allclose(slopes.mean(), high - low, atol=3 / count * np.abs(slopes).mean())
-    assert abs(high - low) > 0.05 * np.abs(slopes).mean()
 
 
 def test_gradients_of_lights_do_not_mix(rng):

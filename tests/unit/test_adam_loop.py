@@ -16,10 +16,8 @@ from envedit.solve import adam_loop
 from tests.oracles.kernels import launched
 from tests.oracles.matrix_renderer import (
     WIDTH,
-    Matrix,
     arrays,
     case,
-    matrix_of,
     same,
     sky,
     without_times,
@@ -94,13 +92,6 @@ def test_terms_without_weight_and_dists_are_left_out(rng):
     assert terms.keys() == {"ssim"}
 
 
-def test_objective_is_zero_at_the_target(rng):
-    picture = rng.random((12, 14, 3)).astype(np.float32)
-    objective = adam_loop.Objective(config.Loss(ssim=1.0, image_l1=1.0), picture, None, sky(rng)[:3], 5)
-    total, _ = objective(mi.TensorXf(picture), mi.TensorXf(sky(rng)[:3]), 0)
-    assert total[0] == 0
-
-
 def test_pixels_without_weight_do_not_count(rng):
     picture = rng.random((24, 30, 3)).astype(np.float32)
     weight = np.zeros((24, 30, 1), np.float32)
@@ -139,25 +130,6 @@ def test_edit_finds_the_map_behind_the_picture(kind, rng):
     assert state.history[-1]["loss"] < 0.01 * state.history[0]["loss"]
 
 
-def test_edit_of_lower_rows_leaves_the_upper_ones(rng):
-    original, true = sky(rng), sky(rng)
-    true[:2] = original[:2]
-    renderer, seen = Matrix(rng), []
-
-    class Watching:
-        def render(self, env, step):
-            seen.append(env.numpy())
-            return renderer.render(env, step)
-
-    objective = adam_loop.Objective(config.Loss(), matrix_of(renderer, true), None, original[2:], 4)
-    representation = representations.Pixels()
-    settings = config.Optimizer(iterations=4, lr=0.02)
-    params = representation.encode(original[2:])
-    adam_loop.optimise(representation, params, Watching(), objective, original, 2, settings)
-    assert all(image[:2].tobytes() == original[:2].tobytes() for image in seen)
-    assert len(seen) == 4 and not np.array_equal(seen[-1][2:], original[2:])
-
-
 def test_texels_that_are_not_free_keep_their_bits_and_pull_nothing(rng):
     """Neither renderer nor regularisers see what the parameters of a kept texel say."""
     free = rng.random((3, WIDTH)) < 0.5
@@ -187,13 +159,6 @@ def test_texels_that_are_not_free_keep_their_bits_and_pull_nothing(rng):
     moved = changed["log_radiance"].numpy() != start
     assert moved[free].all() and not moved[~free].any()
     assert len(seen) == 6 and state.bad_steps == 0
-
-
-def test_first_step_of_adam_has_the_size_of_the_learning_rate(rng):
-    arguments, _ = case(rng, iterations=1, lr=0.02)
-    params, _ = adam_loop.optimise(*arguments)
-    moved = params["log_radiance"].numpy() - arguments[1]["log_radiance"].numpy()
-    np.testing.assert_allclose(np.abs(moved), 0.02, rtol=1e-2)
 
 
 def test_history_has_a_row_for_every_iteration(rng):

@@ -54,14 +54,12 @@ def test_a_light_constant_in_every_cell_is_rendered_as_by_the_transport(shape, g
 
 
 @pytest.mark.parametrize("shape, grid", SIZES)
-def test_averages_over_blocks_and_cells(shape, grid, rng):
+def test_averages_over_blocks(shape, grid, rng):
     result = block_transport.make(transport(rng, shape, grid)[0], shape, grid)
-    pixels, texels = sides(shape, grid)
-    picture, values, weight = rng.random((*shape, 2)), rng.random((*grid, 3)), rng.random(grid)
+    pixels, _ = sides(shape, grid)
+    picture = rng.random((*shape, 2))
     expected = [picture[b].mean(axis=(0, 1)) for b in tiles(*shape, pixels)]
     np.testing.assert_allclose(result.to_blocks(picture), expected, rtol=1e-12)
-    expected = [np.average(values[c].reshape(-1, 3), 0, weight[c].ravel()) for c in tiles(*grid, texels)]
-    np.testing.assert_allclose(result.to_cells(values.reshape(-1, 3), weight.ravel()), expected, rtol=1e-12)
 
 
 @pytest.mark.parametrize("shape, grid", SIZES)
@@ -83,14 +81,6 @@ def test_no_more_tiles_than_stated():
     matrix = ColourMatrix(empty, empty, np.zeros((0, 3), np.float32), (97 * 31, 12 * 200))
     result = block_transport.make(matrix, (97, 31), (12, 200))
     assert result.matrix.shape == (3, 25 * 8, 3 * 50) and not result.matrix.any()
-
-
-def test_a_cell_without_weight_is_zero(rng):
-    result = block_transport.make(transport(rng, (4, 6), (3, 10))[0], (4, 6), (3, 10))
-    weight = np.ones(30)
-    weight[7] = 0
-    means = result.to_cells(np.ones((30, 3)), weight)
-    assert not means[7].any() and (np.delete(means, 7, axis=0) == 1).all()
 
 
 def test_no_block_is_of_two_views(rng):

@@ -6,13 +6,11 @@ import math
 import os
 import zipfile
 
-import mitsuba as mi
 import numpy as np
 import pytest
 
 from envedit import config
 from envedit.core.errors import InputError
-from envedit.losses import optimizer
 from envedit.solve import checkpoint, gauss_newton
 from envedit.solve.adam_loop import State
 
@@ -54,32 +52,9 @@ def test_a_renderer_without_state_and_a_history_with_bad_steps(tmp_path, rng):
     assert renderer == {} and math.isnan(found.history[0]["loss"]) and found.history[1]["loss"] == math.inf
 
 
-def test_an_optimiser_continues_from_it(tmp_path, rng):
-    grads = [{"p": mi.TensorXf(rng.normal(size=(2, 3)).astype(np.float32))} for _ in range(6)]
-    start = {"p": mi.TensorXf(rng.random((2, 3)).astype(np.float32))}
-    whole, first, second = (optimizer.Adam(start, 0.1) for _ in range(3))
-    for g in grads:
-        whole.step(g)
-    for g in grads[:3]:
-        first.step(g)
-    checkpoint.save(tmp_path, "what", State(3), first.state_dict(), {}, PICTURE)
-    state, optimiser, _, picture = checkpoint.load(tmp_path, "what")
-    second.load_state_dict(optimiser)
-    for g in grads[state.step :]:
-        second.step(g)
-    np.testing.assert_array_equal(second.params["p"].numpy(), whole.params["p"].numpy())
-
-
 def test_no_checkpoint_is_none(tmp_path):
     assert checkpoint.load(tmp_path, "what") is None
     assert checkpoint.load(tmp_path / "nowhere", "what") is None
-
-
-def test_a_newer_one_takes_the_place_of_the_older(tmp_path, rng):
-    _, optimiser, renderer = example(rng)
-    for step in (10, 20):
-        checkpoint.save(tmp_path, "what", State(step), optimiser, renderer, PICTURE)
-    assert checkpoint.load(tmp_path, "what")[0].step == 20
 
 
 def test_a_failed_write_leaves_the_older_one(tmp_path, rng, monkeypatch):

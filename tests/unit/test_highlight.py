@@ -6,6 +6,7 @@ import pytest
 from envedit.representations.layers import placed_lights
 from envedit.representations.layers.placed_lights import angles
 from envedit.scene import highlight, scene
+from envedit.scene.camera_paths import NoPlaceError
 from tests.oracles.builders import BALL, LIGHT, SENSOR, write_scene
 from tests.oracles.tiers import slow_but
 
@@ -61,15 +62,15 @@ def test_where_no_light_can_do_it_the_reason_is_told(tmp_path):
     for name in "abc":
         (tmp_path / name).mkdir()
     lit = scene.load(write_scene(tmp_path / "a", SENSOR, LIGHT, BALL), width=32)
-    with pytest.raises(highlight.NoHighlightError, match="not glossy"):
+    with pytest.raises(NoPlaceError, match="not glossy"):
         highlight.direction(lit, 0, 0.5, 0.5)
     floor = '<shape type="rectangle"><transform name="to_world"><scale value="50"/>'
     floor += '<rotate x="1" angle="-90"/><translate y="-1"/></transform></shape>'
     lit = ball(tmp_path / "b", GLOSSY["rough"], floor)
-    with pytest.raises(highlight.NoHighlightError, match="another object is reflected"):
+    with pytest.raises(NoPlaceError, match="another object is reflected"):
         highlight.direction(lit, 0, 0.5, 0.62)
     highlight.direction(lit, 0, 0.5, 0.45)
     hidden = '<integrator type="path"><boolean name="hide_emitters" value="true"/></integrator>'
     lit = ball(tmp_path / "c", GLOSSY["coated"], hidden)
-    with pytest.raises(highlight.NoHighlightError, match="not glossy"):
+    with pytest.raises(NoPlaceError, match="not glossy"):
         highlight.direction(lit, 0, 0.02, 0.02)

@@ -18,6 +18,8 @@ MAP = np.ones((8, 16, 3), np.float32)
 class Recording:
     """A picture that stands for T E."""
 
+    scene = SimpleNamespace(rows=())
+
     def __init__(self, picture, spp):
         self.picture, self.spp = picture.astype(np.float32), spp
 

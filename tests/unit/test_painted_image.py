@@ -14,7 +14,7 @@ from envedit.core.errors import ConfigError, InputError
 from envedit.core.seeds import Seeds
 from envedit.images import images
 from envedit.targets import initial_rendering, painted_image
-from tests.oracles.builders import chunk, exr, turned, with_chunk, with_segment
+from tests.oracles.builders import chunk, exr, with_chunk
 
 SIZE = (60, 83)  # no multiple of a JPEG's blocks
 RECTANGLE = (slice(13, 37), slice(21, 50))
@@ -490,34 +490,6 @@ def test_interlaced(tmp_path):
     found = painted_image.read(tmp_path / "p.png", (2, 2), "linear").picture * 65535
     np.testing.assert_allclose(found[..., 0], [[1, 2], [3, 4]], rtol=1e-6)
     np.testing.assert_allclose(found[..., 2], [[60001, 60002], [60003, 60004]], rtol=1e-6)
-
-
-def test_turned_pictures_are_turned_upright(initial, tmp_path):
-    wanted = codes(brushed(initial)[0])
-    covered = painted_image.read(png(tmp_path / "w.png", wanted), SIZE, "gamma", initial).coverage
-    file = with_chunk(png(tmp_path / "p.png", np.rot90(wanted)), b"eXIf", turned(6))
-    found = painted_image.read(file, SIZE, "gamma", initial)
-    np.testing.assert_array_equal(found.coverage, covered)
-    assert "p.png: turned upright, as its EXIF orientation 6 says" in told(found)
-    half = np.ascontiguousarray(wanted[::-1, ::-1])
-    file = with_segment(jpeg(tmp_path / "p.jpg", half), 0xE1, b"Exif\0\0" + turned(3))
-    assert 0.5 < painted_image.read(file, SIZE, "gamma", initial).coverage.sum() / covered.sum() < 1.5
-    for damage in (b"", b"II", b"MM\0*\xff\xff\xff\xff", b"MM\0*\0\0\0\x08\xff\xff", turned(0), turned(9)):
-        with_segment(jpeg(tmp_path / "q.jpg", wanted), 0xE1, b"Exif\0\0" + damage)
-        assert painted_image.read(tmp_path / "q.jpg", SIZE, "gamma", initial).coverage.any()
-
-
-@pytest.mark.parametrize(
-    ("profile", "odd"),
-    [(b"desc sRGB IEC61966-2.1", False), ("sRGB".encode("utf-16-be"), False), (b"Display P3", True)],
-)
-def test_a_colour_profile_is_told(profile, odd, initial, tmp_path):
-    wanted = codes(brushed(initial)[0])
-    file = with_chunk(png(tmp_path / "p.png", wanted), b"iCCP", b"ICC\0\0" + zlib.compress(profile))
-    assert ("colour profile" in told(painted_image.read(file, SIZE, "gamma", initial))) is odd
-    segment = b"ICC_PROFILE\0\1\1" + profile
-    file = with_segment(jpeg(tmp_path / "p.jpg", wanted), 0xE2, segment)
-    assert ("colour profile" in told(painted_image.read(file, SIZE, "gamma", initial))) is odd
 
 
 def test_cmyk_is_refused(initial, tmp_path):

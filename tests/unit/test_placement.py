@@ -6,6 +6,7 @@ import pytest
 from envedit.images import images
 from envedit.representations.layers.placed_lights import direction
 from envedit.scene import placement, scene, shadow
+from envedit.scene.camera_paths import NoPlaceError
 from tests.oracles.builders import LIGHT, SENSOR, write_scene
 from tests.unit.test_shadow import FLOOR, ORIGIN, SMALL_BALL, on_picture
 
@@ -75,17 +76,17 @@ def test_a_shadow_falls_where_it_is_asked_for_from_the_direction_that_is_closest
 def test_why_a_light_cannot_be_placed_is_said(lit, tmp_path):
     sky = (0.5, 0.02)
     for place in (placement.illuminating, placement.rimming, placement.shading):
-        with pytest.raises(placement.NoPlaceError, match="no surface is seen"):
+        with pytest.raises(NoPlaceError, match="no surface is seen"):
             place(lit, 0, *sky)
-    with pytest.raises(placement.NoPlaceError, match="faces the camera"):
+    with pytest.raises(NoPlaceError, match="faces the camera"):
         placement.rimming(lit, 0, *on_picture(0.5 * EYE))
-    with pytest.raises(placement.NoPlaceError, match="in the way"):
+    with pytest.raises(NoPlaceError, match="in the way"):
         placement.rimming(lit, 0, *on_picture(on_ball(50, -90)))
-    with pytest.raises(placement.NoPlaceError, match="no object stands above"):
+    with pytest.raises(NoPlaceError, match="no object stands above"):
         placement.shading(lit, 0, *on_picture(on_ball(20, 90)))
     mirror = '<shape type="sphere"><bsdf type="conductor"/></shape>'
     mirrored = scene.load(write_scene(tmp_path, SENSOR, LIGHT, mirror, name="mirror.xml"), width=64)
-    with pytest.raises(placement.NoPlaceError, match="no object stands above"):
+    with pytest.raises(NoPlaceError, match="no object stands above"):
         placement.shading(mirrored, 0, 0.5, 0.6)
-    with pytest.raises(placement.NoPlaceError, match="only mirrors"):
+    with pytest.raises(NoPlaceError, match="only mirrors"):
         placement.illuminating(mirrored, 0, 0.5, 0.5)

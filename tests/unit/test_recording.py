@@ -9,7 +9,7 @@ import pytest
 
 from envedit.core.errors import InputError
 from envedit.scene import scene
-from envedit.transport import path_vertices, recording
+from envedit.transport import recording
 from envedit.transport.light_transport import LightTransport
 from envedit.transport.texel_sampling import Grid
 
@@ -129,28 +129,6 @@ def test_an_index_into_the_exact_columns_fits_into_32_bits(size):
 
     _, capacity, _ = recording.choose_samples(Film(), "auto", 256 * 128, 1e4)
     assert 4 * (size * size + 7) * capacity < 2**32 and (capacity == 256 or size > 1024)
-
-
-@pytest.mark.slow
-def test_exact_columns_leave_out_and_count_what_is_not_finite(monkeypatch):
-    s, sky = scene.load("matte", 8, 8), np.ones((4, 8, 3), np.float32)
-    sky[1, 3] = 300
-    clean, spoiled = (LightTransport.build(s, 4, 8, spp=4, max_depth=2, memory_gb=0.1) for _ in range(2))
-    clean.resolve(sky, tolerance=0)
-    real = path_vertices.connect
-
-    def connect(*arguments):
-        value = real(*arguments)
-        middle = dr.width(value) // 2
-        return dr.select(dr.arange(mi.UInt32, dr.width(value)) == middle, NAN, value)
-
-    monkeypatch.setattr(path_vertices, "connect", connect)
-    spoiled.resolve(sky, tolerance=0)
-    assert len(spoiled.columns) == len(clean.columns) > 0
-    assert left_out(spoiled) == [len(spoiled.columns)]  # one vertex, every column
-    wanted, got = (t.apply(mi.TensorXf(sky)).numpy() for t in (clean, spoiled))
-    assert np.isfinite(got).all() and (got != wanted).any()
-    np.testing.assert_allclose(got.sum(), wanted.sum(), rtol=0.2)
 
 
 @pytest.mark.slow

@@ -164,13 +164,6 @@ def test_black_texels_can_be_lit(kind, below):
     assert (np.array(dr.grad(leaf)) > 0).all()
 
 
-def test_pixels_below_zero_are_black_and_log_pixels_are_never_below():
-    params = {"radiance": mi.TensorXf(np.full((1, 2, 3), -0.5, np.float32))}
-    assert not representations.Pixels().decode(params).numpy().any()
-    params = {"log_radiance": mi.TensorXf(np.full((1, 2, 3), -100, np.float32))}
-    assert not representations.LogPixels().decode(params).numpy().any()
-
-
 def test_siren_keeps_a_fit_for_each_place_in_a_map(tmp_path, rng):
     image, cached = sky(rng), []
     for rows in (None, (0, 8), (0, 16), (8, 16), (8, 16)):

@@ -37,10 +37,6 @@ def test_it_is_the_formula_and_keeps_luminance(exponent, value, rng):
     np.testing.assert_allclose(made @ LUMINANCE, radiance @ LUMINANCE, rtol=1e-5)
 
 
-def test_black_stays_black():
-    assert (of(np.zeros((4, 3)), 0.3) == 0).all()
-
-
 @pytest.mark.parametrize("horizon", ["mirror", "keep", "free"])
 def test_a_sky_of_one_colour_stays_that_colour_and_photographed_ground_stays_as_it_is(horizon, rng):
     """What follows the sky's mirror loses its colours with it, ground does not."""

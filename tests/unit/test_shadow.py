@@ -6,6 +6,7 @@ import pytest
 from envedit.representations.layers import placed_lights
 from envedit.representations.layers.placed_lights import angles, direction
 from envedit.scene import scene, shadow
+from envedit.scene.camera_paths import NoPlaceError
 from tests.oracles.builders import BALL, LIGHT, SENSOR, write_scene
 
 FLOOR = (
@@ -64,9 +65,9 @@ def test_where_there_is_no_shadow_the_reason_is_given(lit):
         ((0.5, 0.02), direction(240.0, 10.0), "no surface is seen"),
         (on_picture(front), -ORIGIN / np.linalg.norm(ORIGIN), "faces away"),
     ):
-        with pytest.raises(shadow.NoShadowError, match=reason):
+        with pytest.raises(NoPlaceError, match=reason):
             shadow.occluder(lit, 0, *place, toward)
-    with pytest.raises(shadow.NoShadowError, match="no surface is seen"):
+    with pytest.raises(NoPlaceError, match="no surface is seen"):
         shadow.direction(lit, 0, 0.5, 0.02, np.zeros(3))
-    with pytest.raises(shadow.NoShadowError, match="faces away"):
+    with pytest.raises(NoPlaceError, match="faces away"):
         shadow.direction(lit, 0, *on_picture(np.array([1.2, -1.0, 0.0])), np.array([0.0, -2.0, 0.0]))

@@ -8,7 +8,7 @@ import pytest
 from envedit import config as cfg
 from envedit.config.stroke_schema import STROKES, StrokeList
 from envedit.core.color import TONEMAPS, inverse_tonemap, luminance, tonemap
-from envedit.core.errors import ConfigError, InputError
+from envedit.core.errors import ConfigError
 from envedit.targets import stroke_shapes, strokes
 from tests.oracles import ROOT
 from tests.oracles.builders import grey, refused
@@ -108,18 +108,6 @@ def test_an_ellipse_turns_from_x_towards_y():
         covered(64, 128, ellipse=[0.5, 0.5, 0.1, 0.4]),
     )
     np.testing.assert_allclose(wide, tall, atol=1e-6)
-
-
-def test_the_distance_to_an_ellipse_is_that_to_its_nearest_point(rng):
-    radii = np.array([3.0, 0.7])
-    t = np.linspace(0, 2 * np.pi, 20001)
-    edge = np.stack([radii[0] * np.cos(t), radii[1] * np.sin(t)], axis=-1)
-    points = np.concatenate([rng.uniform(-4, 4, (60, 2)), [[0, 0], [2.9, 0], [0, 0.5], [3.5, 0], [1, 0]]])
-    nearest = np.array([np.sqrt(((edge - p) ** 2).sum(axis=1).min()) for p in points])
-    inside = ((points / radii) ** 2).sum(axis=1) < 1
-    np.testing.assert_allclose(
-        stroke_shapes._to_ellipse(points, radii), np.where(inside, -nearest, nearest), atol=1e-5
-    )
 
 
 def test_a_soft_edge_is_a_smooth_step_half_inside_and_half_outside():
@@ -252,13 +240,6 @@ def test_black_bodies_have_the_colours_of_the_literature():
     assert (strokes.gains(2000) > 0).all()
 
 
-def test_temperature_is_the_same_factor_for_every_pixel(rng):
-    """So that a map under those gains answers it exactly."""
-    picture = (0.1 + rng.random((8, 8, 3))).astype(np.float32)
-    ratio = painted(picture, type="temperature", kelvin=4000) / picture
-    np.testing.assert_allclose(ratio, np.broadcast_to(ratio[0, 0], ratio.shape), rtol=1e-5)
-
-
 def test_contrast_is_a_factor_about_the_mean_of_display_values(rng):
     shown = 0.3 + 0.3 * rng.random((32, 32, 3))
     picture = inverse_tonemap(shown).astype(np.float32)
@@ -380,20 +361,6 @@ def test_strokes_that_paint_nothing_say_so():
     assert "target.strokes[0] (shadow)" in outside and "outside the 16x8 picture" in outside
     assert "target.strokes[1] (light)" in also and "target.strokes[4]" in far
     assert "opacity 0" in unseen and "target.strokes[3] (erase-shadow): covers the whole picture" in all_of_it
-
-
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e39])
-def test_a_picture_that_is_not_finite_is_refused_by_place(bad):
-    picture = grey(0.5).astype(np.float64)
-    picture[3, 7, 1] = bad
-    with pytest.raises(InputError, match="pixel at row 3, column 7 is not finite"):
-        strokes.paint(picture, [])
-
-
-@pytest.mark.parametrize("picture", [np.zeros((4, 4)), np.zeros((0, 4, 3)), np.zeros((4, 4, 4)), [["a"]]])
-def test_a_picture_of_another_shape_is_refused(picture):
-    with pytest.raises(InputError, match=r"got shape \(.*expected \(h, w, 3\)"):
-        strokes.paint(picture, [])
 
 
 def test_an_unknown_tonemap_is_refused():

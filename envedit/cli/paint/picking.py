@@ -14,6 +14,7 @@ from envedit.core.arrays import tensor
 from envedit.core.rows import Rows
 from envedit.representations.layers.placed_lights import PlacedLights, angles, direction, flux_of
 from envedit.scene import highlight, placement, shadow
+from envedit.scene.camera_paths import NoPlaceError
 from envedit.scene.scene import Scene
 from envedit.transport.light_transport import LightTransport
 
@@ -100,7 +101,7 @@ class Picking:
             found: dict[str, Any] = {"light": asked.light}
             try:
                 toward = self._direction(asked, view, shown)
-            except (highlight.NoHighlightError, shadow.NoShadowError, placement.NoPlaceError) as reason:
+            except NoPlaceError as reason:
                 return found | {"text": str(reason)}
             row, _ = latlong.texel_position(toward, *self.placed.envmap.shape[:2])
             if not self.rows.first <= round(float(row)) < self.rows.stop:
@@ -122,7 +123,7 @@ class Picking:
         if asked.of == "highlight":
             return highlight.direction(self.scene, view, asked.x, asked.y)
         if not asked.point:
-            raise shadow.NoShadowError("no shadow was picked")
+            raise NoPlaceError("no shadow was picked")
         return shadow.direction(self.scene, view, asked.x, asked.y, np.array(asked.point))
 
     def _shadowed(self, asked, view, listed):
@@ -134,7 +135,7 @@ class Picking:
             try:
                 point = shadow.occluder(self.scene, view, asked.x, asked.y, listed[i].direction)
                 return {"light": i, "point": point.tolist()}
-            except shadow.NoShadowError as reason:
+            except NoPlaceError as reason:
                 text = f"light {i + 1}: {reason}" if text == "the map has no light" else text
         return {"light": -1, "text": text}
 

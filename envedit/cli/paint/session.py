@@ -497,9 +497,16 @@ class Session:
     def _reach(self):
         """Ask how much of what is painted any light could do; a newer edit ends it."""
         self._tell_doing("estimating how much of the target is feasible")
-        asked = self.problem.envmap, self.target, self.problem.likelihood, self.rows, None
-        painted, known = self.coverage[..., 0], self.point.edited
-        self.reach = feasibility.reachable(self._watched, *asked, painted, self.base, known)
+        self.reach = feasibility.reachable(
+            self._watched,
+            self.problem.envmap,
+            self.target,
+            self.problem.likelihood,
+            self.rows,
+            painted=self.coverage[..., 0],
+            rendered=self.base,
+            known=self.point.edited,
+        )
         self._tell_unreachable()
         self.tell_state()
 

@@ -5,10 +5,14 @@ from __future__ import annotations
 import os
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
 
 from envedit import config
 from envedit.config import presets
 from envedit.core.array_cache import cache_folder
+
+if TYPE_CHECKING:
+    from envedit.losses.perceptual.distances import Dists, Lpips
 
 VGG, DISTS = "vgg16_features.npz", "dists_alpha_beta.npz"
 BACKBONES = {"alex": "alexnet_features.npz", "vgg": VGG, "squeeze": "squeezenet_features.npz"}
@@ -60,6 +64,36 @@ def settled(settings: config.Config) -> config.Config:
         plain = presets.MANY_PARAMETERS["standard"]["optimizer"]["iterations"]
         optimizer = replace(optimizer, iterations=STEPS_WITH_DISTS if able and loss.dists else plain)
     return replace(settings, loss=loss, optimizer=optimizer)
+
+
+class Networks(NamedTuple):
+    """What the perceptual terms of a run are computed with."""
+
+    settings: config.Config  # with numbers in the place of "auto"
+    dists: Dists | None  # where the loss has it, and there are weights
+    lpips: Lpips | None  # where there are weights
+    note: str  # that DISTS is off, as there are no weights; "" where it is on, or not asked for
+
+
+def load(settings: config.Config) -> Networks:
+    """Settle a configuration by the weights that there are, and load the networks.
+
+    Raises
+    ------
+    InputError
+        A file cannot be read, or lacks a tensor.
+    """
+    from envedit.losses.perceptual import backbones, distances
+
+    chosen = settled(settings)
+    paths = files(chosen)
+    dists = None
+    lpips = None
+    if "vgg" in paths:
+        dists = distances.Dists(backbones.Backbone.load("vgg", paths["vgg"]), paths["dists"])
+    if "backbone" in paths:
+        lpips = distances.Lpips(chosen.perceptual.network, paths["backbone"], paths["heads"])
+    return Networks(chosen, dists, lpips, missing(settings))
 
 
 def missing(settings: config.Config) -> str:

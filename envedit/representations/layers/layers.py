@@ -85,40 +85,18 @@ class Layers:
     """Lights that move, a background under a smooth gain; made by :meth:`of`, and never changed.
 
     Parameters may hold ``saturation`` (1, 1), the logarithm of k of ``saturation.py``; without it, k is 1.
-
-    Attributes
-    ----------
-    rows : (int, int)
-        First row of the image in its map, and the rows of that map.
-    whole : (int, int)
-        Rows and columns of the image.
-    separation : Separation
-        Lights and background of the rows above the horizon, or of all where none follow.
-    lights : Lights
-        Its lights and spare ones.
-    gain : GridGain
-        The gain's grids.
-    base : ndarray (rows, W, 3) float32
-        E_0', of the rows of the separation.
-    behind : BehindGlow or None
-        What is seen where a glow has gone; None without glows.
-    below : Below or None
-        The rows that follow.
-    free : ndarray of bool (rows, W) or None
-        Texels that gain and saturation act on; None: all.
-    fixed : ndarray (rows, W, 3) or None
-        Radiance of locked lights, which is added to the cores whatever the parameters are; None: 0.
     """
 
-    rows: tuple[int, int]
-    whole: tuple[int, int]
-    separation: Separation
-    lights: Lights
-    gain: GridGain
-    base: np.ndarray
-    behind: BehindGlow | None = None
-    below: Below | None = None
-    free: np.ndarray | None = None
+    rows: tuple[int, int]  # first row of the image in its map, and the rows of that map
+    whole: tuple[int, int]  # rows and columns of the image
+    separation: Separation  # lights and background of the rows above the horizon, or of all where none follow
+    lights: Lights  # its lights and spare ones
+    gain: GridGain  # the gain's grids
+    base: np.ndarray  # (rows, W, 3) float32, E_0', of the rows of the separation
+    behind: BehindGlow | None = None  # what is seen where a glow has gone; None without glows
+    below: Below | None = None  # the rows that follow
+    free: np.ndarray | None = None  # bool (rows, W), texels that gain and saturation act on; None: all
+    # (rows, W, 3), radiance of locked lights, added to the cores whatever the parameters are; None: 0
     fixed: np.ndarray | None = None
 
     lr = 0.03

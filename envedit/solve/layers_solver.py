@@ -104,10 +104,7 @@ class LayersSolver:
         point = problem.evaluate(solution.run.state)  # what was tried since may have taken its columns
         self.begun = solution.run
         if point.residual is not None:  # what T errs by may have been fitted
-            if problem.photographed:
-                residual = problem.residual(point.state, self._path_traced(point.edited))
-            else:
-                residual = self._missed(point.edited).astype(np.float64)
+            residual = problem.residual(point.state, self._path_traced(point.edited))
             point = replace(point, residual=residual)
         return search.score(problem, solution.run, point, self._sigma)
 

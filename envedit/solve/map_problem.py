@@ -60,7 +60,6 @@ class Photographed:
     # (3,), exposure and white balance by which the target has been divided, less what they are drawn to
     log_factor: np.ndarray
     precision: np.ndarray  # (3, 3), inverse covariance of their sum, about 0
-    clipped: np.ndarray  # bool (h, w, 3), where the target is a lower bound
 
 
 @dataclass(frozen=True)
@@ -105,6 +104,8 @@ class Problem(Unknowns):
         Of another problem of these layers and this transport; made where None.
     photo : Photographed, optional
         Of a photograph as the target.
+    clipped : ndarray of bool (h, w, 3), optional
+        Where the target is a lower bound.
     """
 
     def __init__(
@@ -118,9 +119,10 @@ class Problem(Unknowns):
         saturates: bool = False,
         blocks: BlockJacobian | None = None,
         photo: Photographed | None = None,
+        clipped: np.ndarray | None = None,
     ):
         super().__init__(layers, saturates, photo is not None)
-        self.photo = photo
+        self.photo, self.clipped = photo, clipped
         self.transport, self.envmap, self.rows = transport, envmap, layers.active
         self.blocks = blocks or BlockJacobian(layers, transport, envmap.shape[:2])
         self.derivatives = Derivatives(self, transport, self.blocks)
@@ -164,9 +166,9 @@ class Problem(Unknowns):
         """Return display values of a rendering (h, w, 3), under a camera's factor, less the target's."""
         shown = display_curve.to_display(tensor(rendering * self._exposure(state))).numpy()
         residual = np.float64(shown) - self.target
-        if self.photo is None:
+        if self.clipped is None:
             return residual
-        return np.where(self.photo.clipped, np.minimum(residual, 0), residual)
+        return np.where(self.clipped, np.minimum(residual, 0), residual)
 
     def _exposure(self, state):
         """Return the factor of every channel between a rendering and the picture, (3,) or 1."""
@@ -176,9 +178,9 @@ class Problem(Unknowns):
         """Return the derivative of the residual by radiance, (h, w, 3)."""
         exposure = self._exposure(point.state)
         slope = display_curve.slope(point.rendering * exposure) * exposure
-        if self.photo is None:
+        if self.clipped is None:
             return slope
-        return np.where(self.photo.clipped & (point.residual >= 0), 0, slope).astype(np.float32)
+        return np.where(self.clipped & (point.residual >= 0), 0, slope).astype(np.float32)
 
     def loss(self, point: Point, start: dict, sigma: float) -> float:
         """Return F."""

@@ -161,10 +161,15 @@ def _neighbours(problem, best, moves, sigma, after_step, steps, sky):
     return neighbours
 
 
-def of_light(problem: Problem) -> float:
-    """Return what an added light costs; of a rendering, also that it could be in any cell."""
+def of_place(problem: Problem) -> float:
+    """Return what a light's place costs that was looked for: of a rendering it could be in any cell."""
     _, directions = problem.blocks.sky
-    return ADDED_LIGHT_COST + 2 * np.log(max(len(directions), 1)) * problem.likelihood.robust
+    return 2 * np.log(max(len(directions), 1)) * problem.likelihood.robust
+
+
+def of_light(problem: Problem) -> float:
+    """Return what an added light costs."""
+    return ADDED_LIGHT_COST + of_place(problem)
 
 
 def score(problem: Problem, run: gauss_newton.Run, point: Point, sigma: float) -> float:
@@ -180,10 +185,17 @@ def score(problem: Problem, run: gauss_newton.Run, point: Point, sigma: float) -
     _, prior = np.linalg.slogdet(normal.precision)
     # ---- What lights cost
     cost = of_light(problem) * len(problem.added(run.state))
+    cost += of_place(problem) * len(_replaced(problem, run))
     if problem.likelihood.robust:
         cost += FADED_LIGHT_COST * len(_faded(problem, run.state))
     evidence = float(unlikeliness + posterior - prior + cost)
     return evidence if np.isfinite(evidence) else np.inf
+
+
+def _replaced(problem, run):
+    """List the map's own lights that shine elsewhere than they did, farther than steps led them."""
+    own = problem.layers.lights.own
+    return [k for k in problem.shining(run.state) if k < own and run.start["turn"][k].any()]
 
 
 def _faded(problem, state):

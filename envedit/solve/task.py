@@ -17,7 +17,10 @@ from envedit.transport.light_transport import LightTransport
 def likelihood(target: Target) -> Likelihood:
     """Return the likelihood of a target's residuals: of a rendering, or of paint where it has coverage."""
     if target.coverage is None:
-        return Likelihood(on_average_one(target.weight, target.picture.shape[:2]))
+        weight = target.weight
+        if weight is not None and target.clipped is not None:
+            weight = np.where(target.clipped.any(axis=2, keepdims=True) & (weight == 0), 1, weight)
+        return Likelihood(on_average_one(weight, target.picture.shape[:2]))
     return Likelihood.of_paint(target.weight, target.coverage, target.initial, target.picture)
 
 
@@ -33,7 +36,7 @@ def problem(
     painted, photograph = target.coverage is not None, None
     if target.photo is not None:
         photo = target.photo
-        photograph = Photographed(photo.camera.log_factor - photo.centre, photo.precision, photo.clipped)
+        photograph = Photographed(photo.camera.log_factor - photo.centre, photo.precision)
     expected = prior.of_paint(settings.solve.freedom, target.coverage) if painted else prior.Prior()
     return Problem(
         layers,
@@ -45,6 +48,7 @@ def problem(
         saturates=not painted,
         blocks=blocks,
         photo=photograph,
+        clipped=target.clipped,
     )
 
 

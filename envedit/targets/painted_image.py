@@ -45,7 +45,7 @@ def read(
       ``tonemap_name``, where one is declared; else the one that the file names, or that of the export, unless
       the unpainted pixels are those of the rendering under another.
     - A picture of another size and the rendering's aspect is resampled.
-    - Where a PNG or JPEG is white in a channel, the value is a lower bound: such pixels are
+    - Where a PNG or JPEG is white in a channel, the value is a lower bound, ``clipped``: such pixels are
       excluded, but for those that were neither painted nor clipped before. Black is no such limit: there is
       nothing below it.
     - With alpha, colour counts as laid over the initial rendering; without that the colour is taken as it
@@ -84,18 +84,17 @@ def read(
 
     # ---- Values, alpha and clipped pixels, at the size of the rendering
     values, alpha, top = planes(file, pixels, warnings)
-    clipped = np.zeros(alpha.shape, bool)
-    if not info["hdr"]:
-        clipped = (values >= 1 - (2 / 255 if info["format"] == "jpeg" else 0)).any(axis=2) & (alpha > 0)
+    clipped = _clipped(values, info) & (alpha > 0)[..., None]
     if spread:
         values, alpha, clipped = _resampled(values, alpha, clipped, shape, info["hdr"])
+    uncertain = clipped.any(axis=2)
 
     # ---- The tonemap, and the rendering under it
     before = None
     name = _tonemap_of(file, info, facts, tonemap_name, exported, warnings)
     if initial is not None:
         if not info["hdr"] and "envedit.tonemap" not in info["metadata"]:
-            seen = (alpha > 0) & ~clipped & (initial > 0).any(axis=2)
+            seen = (alpha > 0) & ~uncertain & (initial > 0).any(axis=2)
             name = _recognised(file, values, seen, initial, name, tonemap_name, warnings)
         if pixels.shape[2] < 3 and not mask and _coloured(initial, name):
             raise InputError(f"{file}: is grey, the rendering is in colour: save it as RGB, or give a mask")
@@ -121,18 +120,19 @@ def read(
         raise InputError(
             f"{file}: nothing of it is painted{remarks}; paint on it, or give a mask that is white there"
         )
-    excluded = clipped | (alpha == 0)
+    excluded = uncertain | (alpha == 0)
     if before is not None:
-        excluded = clipped & ((coverage > 0) | (before >= 1 - 0.5 / top).any(axis=2))
-    if count := int((excluded & (coverage > 0)).sum()):
-        if (excluded | (coverage == 0)).all():
-            raise InputError(
-                f"{file}: all that is painted is clipped, and says only 'at least so bright': "
-                'paint below white, or on an .exr, or under [target] tonemap = "reinhard"'
-            )
+        excluded = uncertain & ((coverage > 0) | (before >= 1 - 0.5 / top).any(axis=2))
+    uncounted = excluded & (coverage > 0)
+    if uncounted.any() and (excluded | (coverage == 0)).all():
+        raise InputError(
+            f"{file}: all that is painted is clipped, and says only 'at least so bright': "
+            'paint below white, or on an .exr, or under [target] tonemap = "reinhard"'
+        )
+    if uncounted.any() and before is not None:
         warnings.append(
-            f"{file}: {count} painted pixels are clipped ('at least so bright') and left out; to have them "
-            "count, paint below white, or on an .exr"
+            f"{file}: {uncounted.sum()} painted pixels are clipped ('at least so bright') and left out; to "
+            "have them count, paint below white, or on an .exr"
         )
 
     # ---- The picture, in linear radiance
@@ -140,7 +140,7 @@ def read(
     if initial is not None:  # to the last bit, not as the file has rounded it
         picture = np.where((painted & (coverage > 0))[..., None], picture, initial)
     picture = np.minimum(picture, np.finfo(np.float32).max).astype(np.float32)
-    return Painted(picture, coverage[..., None].astype(np.float32), excluded, tuple(warnings))
+    return Painted(picture, coverage[..., None].astype(np.float32), excluded, clipped, tuple(warnings))
 
 
 def given(picture: np.ndarray, shape: Shape, initial: np.ndarray, mask: np.ndarray | None = None) -> Painted:
@@ -179,9 +179,8 @@ def given(picture: np.ndarray, shape: Shape, initial: np.ndarray, mask: np.ndarr
     if not coverage.any():
         raise InputError("target: nothing of the picture is painted")
     picture = np.where(coverage[..., None] > 0, np.minimum(picture, np.finfo(np.float32).max), initial)
-    return Painted(
-        picture.astype(np.float32), coverage[..., None].astype(np.float32), np.zeros(shape, bool), ()
-    )
+    nothing = np.zeros(shape, bool)
+    return Painted(picture.astype(np.float32), coverage[..., None].astype(np.float32), nothing)
 
 
 def read_mask(file: FilePath, shape: Shape) -> np.ndarray:
@@ -232,6 +231,13 @@ def _spread_of_resampling(file, size, shape, warnings):
     return int(np.ceil(3 * max(1, height / rows, width / columns)))
 
 
+def _clipped(values, info):
+    """Return which values (h, w, 3) of a file say "at least so bright": a JPEG's white is not quite."""
+    if info["hdr"]:
+        return np.zeros(values.shape, bool)
+    return values >= 1 - (2 / 255 if info["format"] == "jpeg" else 0)
+
+
 def _resampled(values, alpha, clipped, shape, premultiplied):
     """Return values, alpha and clipped pixels at another size; colour is averaged by its alpha."""
     weight = alpha[..., None]
@@ -240,7 +246,7 @@ def _resampled(values, alpha, clipped, shape, premultiplied):
     if not premultiplied:
         new = new / np.where(new_alpha > 0, new_alpha, 1)
     new_alpha = np.where(new_alpha > 1 - 1e-6, 1, new_alpha)  # a sum of weights, in single precision
-    return new, new_alpha[..., 0], fit(clipped[..., None], *shape[:2])[..., 0] > 0
+    return new, new_alpha[..., 0], fit(clipped, *shape[:2]) > 0
 
 
 def check_finite(file: FilePath, pixels: np.ndarray, advice: str) -> None:

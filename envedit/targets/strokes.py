@@ -60,6 +60,7 @@ class Painted:
     coverage: np.ndarray
     # bool (h, w), pixels of a file without information: clipped, or transparent over nothing; None: none
     excluded: Any = None
+    clipped: Any = None  # bool (h, w, 3), values of a file that say "at least so bright"; None: none
     warnings: tuple[str, ...] = ()  # what the user should know
 
 

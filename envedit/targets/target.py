@@ -59,6 +59,9 @@ class Target:
     # (h, w, 3), what the loop compares T E with, linear radiance; None: the picture. Usually the picture as T
     # sees it (:meth:`seen_as`)
     compared: np.ndarray | None = None
+    # bool (h, w, 3), values that say "at least so bright": lower bounds of Gauss-Newton steps; in a picture
+    # of the scene their pixels have no weight for all else. None: none
+    clipped: np.ndarray | None = None
     # The photograph that the picture is, as far as its camera is known
     photo: photographs.Photo | None = None
 
@@ -87,7 +90,8 @@ class Target:
             weight = np.ones_like(before) if weight is None else weight
             share = np.divide(weight, before, out=np.zeros_like(before), where=before > 0)
             weight = share * photograph.counts
-        return replace(self, photo=photograph, picture=picture, weight=weight, compared=None)
+        seen = replace(self, photo=photograph, clipped=photograph.clipped & (photograph.counts > 0))
+        return replace(seen, picture=picture, weight=weight, compared=None)
 
     def held(self, paint: float, hold: float) -> Target:
         """Return the target with other weights of paint and rest, among the pixels that count."""
@@ -227,12 +231,14 @@ def _of_rendering(settings, scene, envmap, picture, mask, how=""):
     if not weight.any():
         raise InputError("target: no pixel of the picture counts: all are clipped, masked or transparent")
     counts = None if (weight == 1).all() else weight
+    clipped = None if image.clipped is None else image.clipped & (image.coverage > 0)
     picture = np.minimum(image.picture, np.float32(BRIGHTEST))
     noise = rendered_anew.noise(picture, scene.rows)
     initial, spp, _ = with_noise(settings, scene, envmap)
     spp = rendered_anew.samples(picture, noise, initial, spp, scene.rows)
     source += f"{how}, as noisy as {spp} samples a pixel"
-    return Target(picture, counts, None, source, tuple(image.warnings), asked=asked, noise=noise, spp=spp)
+    target = Target(picture, counts, None, source, tuple(image.warnings), asked=asked, noise=noise, spp=spp)
+    return replace(target, clipped=clipped)
 
 
 def _of_photo(settings, scene, envmap, picture, mask):
@@ -300,7 +306,8 @@ def _painted_strokes(scene, initial, chosen):
         own = [i for i, number in enumerate(numbers) if number == k]
         made = strokes.paint(before, [chosen.strokes[i] for i in own], chosen.display_tonemap)
         warnings.extend(_renumbered(line, own) for line in made.warnings)
-        return replace(made, excluded=np.zeros(before.shape[:2], bool), warnings=())
+        nothing = np.zeros(before.shape, bool)
+        return replace(made, excluded=nothing[..., 0], clipped=nothing, warnings=())
 
     painted = _of_views(scene, initial, numbers, of_view)
     if not painted.coverage.any():
@@ -323,12 +330,11 @@ def _of_views(scene, initial, painted, of_view):
         else:
             shape = before.shape[:2]
             bare = np.zeros((*shape, 1), np.float32)
-            parts.append(strokes.Painted(before, bare, np.zeros(shape, bool)))
-    picture, coverage, excluded = (
-        np.concatenate([getattr(p, name) for p in parts]) for name in ("picture", "coverage", "excluded")
-    )
+            parts.append(strokes.Painted(before, bare, np.zeros(shape, bool), np.zeros(before.shape, bool)))
+    names = "picture", "coverage", "excluded", "clipped"
+    stacked = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
     warnings = tuple(line for part in parts for line in part.warnings)
-    return strokes.Painted(picture, coverage, excluded, warnings)
+    return strokes.Painted(**stacked, warnings=warnings)
 
 
 def _seen(target, hidden, curve):

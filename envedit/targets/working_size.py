@@ -77,6 +77,8 @@ def worked_on(
             picture, noise, spp = target.picture, rendered_anew.noise(target.picture, small.rows), target.spp
         elif target.envmap is None:  # a picture of the scene
             picture = at_size(target.picture, scene, small)
+            if target.clipped is not None:
+                target = replace(target, clipped=at_size(target.clipped, scene, small) > 0)
             noise = rendered_anew.noise(picture, small.rows)
             spp = rendered_anew.samples(picture, noise, *with_noise(settings, small, envmap)[:2], small.rows)
         else:

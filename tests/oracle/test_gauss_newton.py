@@ -98,9 +98,9 @@ def photographed():
     factor = np.array([0.4, 0.1, -0.3])
     clipped = np.zeros((*FILM, 3), bool)
     clipped[::2, ::2] = True
-    photo = map_problem.Photographed(factor, np.diag([3.0, 4.0, 5.0]), clipped)
+    photo = map_problem.Photographed(factor, np.diag([3.0, 4.0, 5.0]))
     problem, params, start, state = moved_case(
-        lambda weight: Likelihood(on_average_one(weight, FILM)), photo=photo
+        lambda weight: Likelihood(on_average_one(weight, FILM)), photo=photo, clipped=clipped
     )
     return problem, params, start, state | {"camera": np.array([[0.3, -0.2, 0.1]])}
 
@@ -149,7 +149,7 @@ def test_gradient_is_that_of_finite_differences(case, sigma):
 @pytest.mark.parametrize("sigma", [0.02, 1.0])
 def test_gradient_of_a_photograph_is_that_of_finite_differences(photographed, sigma):
     problem, _, start, state = photographed
-    clipped = problem.photo.clipped
+    clipped = problem.clipped
     residual = problem.evaluate(state).residual
     assert (residual[clipped] == 0).mean() == pytest.approx(0.5, abs=0.4) and (residual[~clipped] > 0).any()
     assert (residual[clipped] <= 0).all()

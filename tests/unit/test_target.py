@@ -13,6 +13,7 @@ from envedit.core.errors import ConfigError, InputError
 from envedit.core.seeds import Seeds
 from envedit.images import images
 from envedit.scene import scene
+from envedit.solve import task
 from envedit.targets import initial_rendering, pixel_weights, target
 from tests.oracles.builders import BALL, LIGHT, SENSOR, exr, sky, write_scene
 from tests.oracles.users_scenes import HIDDEN
@@ -260,8 +261,13 @@ def test_pixels_of_a_picture_that_are_clipped_or_masked_do_not_count(ball, pictu
     file, masked = (str(png(tmp_path / name, v)) for name, v in (("a.png", values), ("m.png", mask)))
     clipped = of_a_picture(ball, pictured, file=file)
     assert not clipped.weight[2, 3:5].any() and clipped.weight.sum() == SIZE[0] * SIZE[1] - 2
+    # But for Gauss-Newton steps, of which they are lower bounds.
+    assert clipped.clipped[2, 3:5].all() and clipped.clipped.sum() == 6
+    assert (task.likelihood(clipped).weight > 0).all()
     both = of_a_picture(ball, pictured, file=file, mask=masked)
     assert both.weight.sum() == 6 * SIZE[1] - 2 and not both.weight[7:].any()
+    weight = task.likelihood(both).weight
+    assert (weight[1:7] > 0).all() and not weight[7:].any()
     array = target.make(
         asking(kind="rendering", file=images.ARRAY), ball, pictured[0], pictured[1], mask[..., 0] / 255
     )

@@ -254,7 +254,7 @@ class Preparation:
     def _encoded(self, crop: np.ndarray) -> tuple[Any, dict]:
         """Return the representation of a map's active rows, and parameters; a fit reports its progress."""
         chosen = self.settings.input
-        horizon = "free"
+        horizon: below_horizon.Horizon = "free"
         if self.settings.representation.kind == "layers":
             horizon = below_horizon.treatment(chosen.horizon, chosen.rows, self.original)
         return representations.encoded(

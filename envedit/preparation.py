@@ -254,13 +254,17 @@ class Preparation:
 
     def _encoded(self, crop: np.ndarray) -> tuple[Any, dict]:
         """Return the representation of a map's active rows, and parameters; a fit reports its progress."""
+        chosen = self.settings.input
+        horizon: below_horizon.Horizon = "free"
+        if self.settings.representation.kind == "layers":
+            horizon = below_horizon.treatment(chosen.horizon, chosen.rows, self.original)
         return representations.encoded(
             crop,
             self.settings,
             fit.default_folder(),
             lambda done, total, loss: self.watch.progress(done, total, f"loss {loss:.4g}"),
             self.rows.place,
-            self._horizon(),
+            horizon,
             None if self.locked is None else self.locked[self.rows.slice],
         )
 
@@ -300,12 +304,6 @@ class Preparation:
             if traced:
                 self.renderer = self._recordings.transport
         return self._recordings
-
-    def _horizon(self):
-        """Return what the rows below the horizon do."""
-        if self.settings.representation.kind != "layers":
-            return "free"
-        return below_horizon.treatment(self.settings.input.horizon, self.settings.input.rows, self.original)
 
     def _count(self, done, total):
         self.watch.progress(done, total, "")

@@ -40,6 +40,23 @@ class Place:
     fall: float
 
 
+def probed(
+    problem: Problem, row: int, column: int, flux: np.ndarray, spacing: int, reach: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return texels (n,) of the sky around one, and pictures (n, pixels, 3) of a flux (3,) in each.
+
+    They are so many texels apart, ``reach`` of them to each side; the pictures are of exact columns.
+    """
+    height, width = problem.envmap.shape[:2]
+    first = problem.rows.start
+    steps = spacing * np.arange(-reach, reach + 1)
+    rows = np.unique(np.clip(row + steps, first, first + problem.layers.shape[0] - 1))
+    texels = (rows[:, None] * width + np.unique((column + steps) % width)).ravel()
+    omega = latlong.lookup_solid_angles(height, width)[texels // width]
+    unit = (flux / omega[:, None]).astype(np.float32)
+    return texels, problem.transport.probe(texels) * unit[:, None, :]
+
+
 class Places:
     """Places of lights that are dark at a point, by the problem's normal equations there.
 
@@ -77,22 +94,13 @@ class Places:
         return places_refined
 
     def _refined(self, place, flux):
-        transport, rows = self.problem.transport, self.problem.rows
         height, width = self.problem.envmap.shape[:2]
-        last, omega = (
-            rows.start + self.problem.layers.shape[0] - 1,
-            latlong.lookup_solid_angles(height, width),
-        )
         row, column = (round(float(x)) for x in latlong.texel_position(place.direction, height, width))
         picture = None
         for spacing, reach in zip(PROBE_SPACINGS, PROBE_REACH, strict=True):
-            if transport.capacity < (2 * reach + 1) ** 2:
+            if self.problem.transport.capacity < (2 * reach + 1) ** 2:
                 break  # memory leaves no exact columns to refine
-            steps = spacing * np.arange(-reach, reach + 1)
-            around = np.unique(np.clip(row + steps, rows.start, last))
-            texels = (around[:, None] * width + np.unique((column + steps) % width)).ravel()
-            unit = (flux / omega[texels // width][:, None]).astype(np.float32)
-            pictures = transport.probe(texels) * unit[:, None, :]
+            texels, pictures = probed(self.problem, row, column, flux, spacing, reach)
             strengths, falls = self._model.of_pixels(pictures)
             at = int(np.argmax(falls))
             if not falls[at] > 0:

@@ -197,16 +197,14 @@ class Problem(Unknowns):
             change = self._flux_change(state, start, i)
             total += change @ self.prior.flux_precision @ change
             total += ((state["size"] - start["size"])[i, 0] / self._deviation("size", i)) ** 2
-            total += (self._angle(state, start, i) / self._deviation("turn", i)) ** 2
+            turn = rotation_between(self.direction(start, i), self.direction(state, i))
+            total += (float(np.linalg.norm(turn)) / self._deviation("turn", i)) ** 2
         return float(total)
 
     def _flux_change(self, state, start, i):
         """Log flux of a light over that of the map; of a light that was added, over that of the start."""
         own = self.layers.lights.own
         return state["flux"][i] - (0.0 if i < own else start["flux"][i])
-
-    def _angle(self, state, start, i):
-        return float(np.linalg.norm(rotation_between(self.direction(start, i), self.direction(state, i))))
 
     # ---- normal equations ----------------------------------------------------------------------------------
 

@@ -14,7 +14,7 @@ import numpy as np
 from envedit.core import latlong
 from envedit.core.arrays import flat, tensor
 from envedit.losses import display_curve
-from envedit.solve.light_places import PLACES_APART_COSINE, PLACES_REFINED
+from envedit.solve.light_places import PLACES_APART_COSINE, PLACES_REFINED, probed
 from envedit.solve.likelihood import Likelihood, of_mean
 from envedit.solve.map_problem import Problem
 
@@ -65,9 +65,8 @@ def best(
 
 def _refined(problem, point, flux, own, direction, sigma):
     """Look around a direction through exact columns; returns direction, factor of the flux, and -2 log."""
-    transport, likelihood = problem.transport, problem.likelihood
+    likelihood = problem.likelihood
     height, width = problem.envmap.shape[:2]
-    omega = latlong.lookup_solid_angles(height, width)
     compared = _Comparison(
         likelihood=likelihood,
         sigma=sigma,
@@ -78,12 +77,7 @@ def _refined(problem, point, flux, own, direction, sigma):
     )
     row, column = (round(float(x)) for x in latlong.texel_position(direction, height, width))
     for spacing in TRIAL_SPACINGS:
-        steps = spacing * np.arange(-1, 2)
-        first = problem.rows.start
-        rows = np.unique(np.clip(row + steps, first, first + problem.layers.shape[0] - 1))
-        texels = (rows[:, None] * width + np.unique((column + steps) % width)).ravel()
-        unit = (flux / omega[texels // width][:, None]).astype(np.float32)
-        pictures = transport.probe(texels) * unit[:, None, :]
+        texels, pictures = probed(problem, row, column, flux, spacing, reach=1)
         factors, unlikeliness = compared.best([tensor(one) for one in pictures.T], own)
         at = int(np.argmin(unlikeliness))
         row, column = divmod(int(texels[at]), width)

@@ -422,6 +422,34 @@ def test_gradient_is_the_finite_difference(kind, top, rng):
     assert seen >= 8
 
 
+def over(light, name):
+    """Ends of paths for a light: rotation vectors (start, end)."""
+    east = np.cross(light.direction, UP)
+    east /= np.linalg.norm(east)
+    polar = math.acos(light.direction[1])  # angle to the zenith
+    return {
+        "texel borders": (np.zeros(3), np.array([0.6, 0.8, -0.1])),
+        "seam": (np.array([0, -0.4, 0.01]), np.array([0, 0.5, 0.02])),
+        "over the pole": (east * (polar - 0.8), east * (polar + 0.3)),
+    }[name]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["texel borders", "seam", "over the pole"])
+def test_gradient_along_a_path_adds_up_to_the_change(name, rng):
+    """Many copies of a light, one at every step of the path: a linear loss is the sum of theirs."""
+    light, count, weight = patch(rng, 3, 46), 1000, weights()
+    start, end = over(light, name)
+    turns = start + (end - start) * ((np.arange(count) + 0.5) / count)[:, None]
+    at = place(made := Lights([light] * count, (0, H), W), turn=turns)
+    (turn, _, _), _ = derivatives(lambda *p: weighted(made.core(*p, (H, W), (0, H)), weight), *at)
+    slopes = turn[:count] @ (end - start)
+    alone = Lights([light], (0, H), W)
+    low, high = ((core(alone, turn=v) * weight).sum() for v in (start, end))
+    np.testing.assert_allclose(slopes.mean(), high - low, atol=3 / count * np.abs(slopes).mean())
+    assert abs(high - low) > 0.05 * np.abs(slopes).mean()
+
+
 def test_gradients_of_lights_do_not_mix(rng):
     both = [patch(rng, 4, 10), patch(rng, 15, 40, peak=10.0)]
     made = Lights(both, (0, H), W)

@@ -28,7 +28,7 @@ from envedit.scene.scene import Scene
 from envedit.solve import initialization, turning
 from envedit.solve.edit_job import Job
 from envedit.solve.edit_state import Watch
-from envedit.solve.search import POSITIVE_EVIDENCE
+from envedit.solve.search import STRONG_EVIDENCE
 from envedit.targets.target import Target
 
 TURNED = 0.5
@@ -126,7 +126,7 @@ class Preparation:
             score, other = (one.job.layers.settle(one.params) for one in (turned, still))
         # As many turns as the map has columns could have been the best one.
         score += 2 * np.log(self.original.shape[1])
-        chosen = still if other < score - POSITIVE_EVIDENCE else turned
+        chosen = still if other < score - STRONG_EVIDENCE else turned
         chosen.notes.append(
             f"-2 log evidence (lower is likelier): {score:.5g} with the sky turned, {other:.5g} without"
         )

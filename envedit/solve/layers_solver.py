@@ -104,8 +104,11 @@ class LayersSolver:
         point = problem.evaluate(solution.run.state)  # what was tried since may have taken its columns
         self.begun = solution.run
         if point.residual is not None:  # what T errs by may have been fitted
-            residual = problem.residual(point.state, self._path_traced(point.edited))
-            point = replace(point, residual=residual)
+            settings = self.edit.settings
+            shown = transport_error.path_traced(
+                self.edit.scene, point.edited, settings.seed, settings.renderer.cache
+            )
+            point = replace(point, residual=problem.residual(point.state, shown))
         return search.score(problem, solution.run, point, self._sigma)
 
     def go_on_from(self, file: str, params: Params) -> None:
@@ -299,19 +302,12 @@ class LayersSolver:
         return task.sigma(self.edit.target)
 
     def _display_error(self, envmap):
-        """Return the mean square of :meth:`_missed`, weighed as the target."""
-        weight = 1 if self.edit.target.weight is None else self.edit.target.weight
-        return float((np.square(self._missed(envmap)) * weight).mean())
-
-    def _missed(self, envmap):
-        """Return display values of Mitsuba's rendering of a map less the target's."""
-        shown = display_curve.to_display(tensor(self._path_traced(envmap)))
-        return shown.numpy() - display_curve.to_display(tensor(self.edit.target.picture)).numpy()
-
-    def _path_traced(self, envmap):
-        """Return Mitsuba's rendering of a map, (h, w, 3)."""
+        """Return the mean square of display values of Mitsuba's rendering of a map less the target's."""
+        target = self.edit.target
         seed = Seeds.of(self.edit.settings.seed).step_check
-        return self.edit.scene.render(envmap, CHECKED_SPP, seed)
+        shown = display_curve.to_display(tensor(self.edit.scene.render(envmap, CHECKED_SPP, seed)))
+        missed = shown.numpy() - display_curve.to_display(tensor(target.picture)).numpy()
+        return float((np.square(missed) * (1 if target.weight is None else target.weight)).mean())
 
 
 class _Checkpoints:

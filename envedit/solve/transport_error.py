@@ -34,5 +34,10 @@ def corrected(
     Its picture stays. ``rendering`` (h, w, 3) is R(E^), ``seed`` that of the configuration. ``keep``: I is
     kept on disk, and a run that is killed and resumed has the same.
     """
-    shown, _, _ = rendered(scene, envmap, SPP, Seeds.of(seed).solution_check, keep)
-    return target.seen_as(rendering, shown)
+    return target.seen_as(rendering, path_traced(scene, envmap, seed, keep))
+
+
+def path_traced(scene: Scene, envmap: np.ndarray, seed: int, keep: bool = True) -> np.ndarray:
+    """Return I(E) of a map E, (h, w, 3), with :data:`SPP` samples; ``keep`` as of :func:`corrected`."""
+    picture, _, _ = rendered(scene, envmap, SPP, Seeds.of(seed).solution_check, keep)
+    return picture

@@ -85,7 +85,7 @@ class Page:
         self.page.wait_for_function(SOLVED)
         sync_api.expect(self.status).to_have_attribute("data-state", "done")
         if rendered:
-            done = re.compile(r"path traced with (64|128|256)")  # by a busy machine not each is seen
+            done = re.compile(r"path traced with (64|80|128)")  # by a busy machine not each is seen
             sync_api.expect(self.status).to_contain_text(done)
 
     def at(self, name, x, y):

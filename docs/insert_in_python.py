@@ -56,4 +56,4 @@ without, with_box = (
 outline = envedit.load_scene("only_box.xml", width=SIZE).alpha[..., None]
 beside = photo.picture * with_box / np.maximum(without, 1e-6)
 composed = outline * with_box + (1 - outline) * beside
-images.write_png("inserted.png", photo.camera.shown(composed))
+images.write_png("inserted.png", photo.camera.shown(composed * photo.let_through))

@@ -160,7 +160,7 @@ class Preparation:
                 lambda envmap, k: self.scene.render(envmap, spp, drawn[k]),
                 self.original,
                 target.picture,
-                target.weight,
+                target.known_weight,
                 thorough=chosen is True,
             )
 
@@ -174,11 +174,11 @@ class Preparation:
         with self.clock("target_s"):
             envmap = latlong.rotate(self.original, degrees)
             shown = self._shown(envmap, target, "turn_check")
-            misfits = _misfits(shown, target.picture, target.weight)
+            misfits = _misfits(shown, target.picture, target.known_weight)
             # A mean of n values in [0, 1] has a standard error of at most 1 / (2 sqrt(n)).
             if misfits[0] > (2 * target.spp) ** -0.5:
                 return False
-            noise = _misfits(shown, self._shown(envmap, target, "target_again"), target.weight)
+            noise = _misfits(shown, self._shown(envmap, target, "target_again"), target.known_weight)
             return all(misfit <= TO_NOISE * least for misfit, least in zip(misfits, noise, strict=True))
 
     def _shown(self, envmap, target, seed):

@@ -49,7 +49,7 @@ def optimise(
     objective = adam_loop.Objective(
         edit.settings.loss,
         edit.target.aim,
-        edit.target.weight,
+        edit.target.known_weight,
         crop,
         settings.iterations,
         dists=edit.dists,

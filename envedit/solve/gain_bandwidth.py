@@ -75,12 +75,12 @@ def octaves(
     if weight is not None:
         slope = slope * np.sqrt(weight)
     omega = latlong.solid_angles(rows[1], width)[rows[0] : rows[0] + height]
-    octaves: list[Octave] = []
+    identified: list[Octave] = []
     cycles = coarsest
     while 2 * cycles <= width:
         size = grid_size(cycles, height / rows[1])
         down, across = splines(size, (height, width))
-        least = LEAST_SHARE if octaves else FIRST_SHARE
+        least = LEAST_SHARE if identified else FIRST_SHARE
         around = down.T @ omega
         total = np.zeros(size)
         # Drawn anew for each octave: of a large map all of them together would take gigabytes.
@@ -95,9 +95,9 @@ def octaves(
                 break
         if share < least:
             break
-        octaves.append(Octave(size, known, share))
+        identified.append(Octave(size, known, share))
         cycles *= 2
-    return octaves
+    return identified
 
 
 def _pulled_back(transport, second, slope, background, first):

@@ -88,7 +88,7 @@ def recordings(
         layers.separation.background,
         layers.rows,
         target.picture,
-        target.weight,
+        target.known_weight,
         2 * CYCLES,
     )
     shares = ", ".join(f"{100 * octave.share:.0f} % at {octave.cycles} cycles" for octave in octaves)

@@ -307,7 +307,8 @@ class LayersSolver:
         seed = Seeds.of(self.edit.settings.seed).step_check
         shown = display_curve.to_display(tensor(self.edit.scene.render(envmap, CHECKED_SPP, seed)))
         missed = shown.numpy() - display_curve.to_display(tensor(target.picture)).numpy()
-        return float((np.square(missed) * (1 if target.weight is None else target.weight)).mean())
+        weight = 1 if target.known_weight is None else target.known_weight
+        return float((np.square(missed) * weight).mean())
 
 
 class _Checkpoints:

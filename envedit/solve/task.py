@@ -17,10 +17,7 @@ from envedit.transport.light_transport import LightTransport
 def likelihood(target: Target) -> Likelihood:
     """Return the likelihood of a target's residuals: of a rendering, or of paint where it has coverage."""
     if target.coverage is None:
-        weight = target.weight
-        if weight is not None and target.clipped is not None:
-            weight = np.where(target.clipped.any(axis=2, keepdims=True) & (weight == 0), 1, weight)
-        return Likelihood(on_average_one(weight, target.picture.shape[:2]))
+        return Likelihood(on_average_one(target.weight, target.picture.shape[:2]))
     return Likelihood.of_paint(target.weight, target.coverage, target.initial, target.picture)
 
 

@@ -59,8 +59,7 @@ class Target:
     # (h, w, 3), what the loop compares T E with, linear radiance; None: the picture. Usually the picture as T
     # sees it (:meth:`seen_as`)
     compared: np.ndarray | None = None
-    # bool (h, w, 3), values that say "at least so bright": lower bounds of Gauss-Newton steps; in a picture
-    # of the scene their pixels have no weight for all else. None: none
+    # bool (h, w, 3), values that say "at least so bright"; None: none
     clipped: np.ndarray | None = None
     # The photograph that the picture is, as far as its camera is known
     photo: photographs.Photo | None = None
@@ -69,6 +68,15 @@ class Target:
     def aim(self) -> np.ndarray:
         """The picture that the loop compares with, (h, w, 3)."""
         return self.picture if self.compared is None else self.compared
+
+    @property
+    def known_weight(self) -> np.ndarray | None:
+        """How much each pixel counts where lower bounds do not, (h, w, 1); None: all the same."""
+        if self.clipped is None or not self.clipped.any():
+            return self.weight
+        weight = np.ones((*self.clipped.shape[:2], 1), np.float32) if self.weight is None else self.weight
+        known = np.where(self.clipped.any(axis=2, keepdims=True), 0, weight).astype(np.float32)
+        return known if known.any() else self.weight  # a few pixels of bounds: better these than nothing
 
     def aimed_at(self, picture: np.ndarray) -> Target:
         """Return the target with another :attr:`aim`."""
@@ -90,8 +98,8 @@ class Target:
             weight = np.ones_like(before) if weight is None else weight
             share = np.divide(weight, before, out=np.zeros_like(before), where=before > 0)
             weight = share * photograph.counts
-        seen = replace(self, photo=photograph, clipped=photograph.clipped & (photograph.counts > 0))
-        return replace(seen, picture=picture, weight=weight, compared=None)
+        known = replace(self, photo=photograph, clipped=photograph.clipped)
+        return replace(known, picture=picture, weight=weight, compared=None)
 
     def held(self, paint: float, hold: float) -> Target:
         """Return the target with other weights of paint and rest, among the pixels that count."""
@@ -227,18 +235,16 @@ def _of_rendering(settings, scene, envmap, picture, mask, how=""):
         asked = tuple(np.fromfile(file, np.uint8) for file in (*chosen.files, *chosen.masks) if file)
 
     # ---- Pixels that count, and its noise
-    weight = np.where(image.excluded[..., None], 0, image.coverage).astype(np.float32)
-    if not weight.any():
+    if not ((image.coverage[..., 0] > 0) & ~image.excluded).any():
         raise InputError("target: no pixel of the picture counts: all are clipped, masked or transparent")
-    counts = None if (weight == 1).all() else weight
-    clipped = None if image.clipped is None else image.clipped & (image.coverage > 0)
+    weight = None if (image.coverage == 1).all() else image.coverage
     picture = np.minimum(image.picture, np.float32(BRIGHTEST))
     noise = rendered_anew.noise(picture, scene.rows)
     initial, spp, _ = with_noise(settings, scene, envmap)
     spp = rendered_anew.samples(picture, noise, initial, spp, scene.rows)
     source += f"{how}, as noisy as {spp} samples a pixel"
-    target = Target(picture, counts, None, source, tuple(image.warnings), asked=asked, noise=noise, spp=spp)
-    return replace(target, clipped=clipped)
+    target = Target(picture, weight, None, source, tuple(image.warnings), asked=asked, noise=noise, spp=spp)
+    return replace(target, clipped=image.clipped)
 
 
 def _of_photo(settings, scene, envmap, picture, mask):

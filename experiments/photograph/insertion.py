@@ -12,13 +12,19 @@ from envedit.core import shipped
 from envedit.losses import metrics
 from envedit.targets.photo import Camera
 
-BALL = """<shape type="sphere">
-    <point name="center" x="1.1" y="0.35" z="1.5"/> <float name="radius" value="0.35"/>
+
+def ball(x: float, z: float, radius: float, colour: str, alpha: float) -> str:
+    """Return a glossy ball on the ground, and the end of its scene."""
+    return f"""<shape type="sphere">
+    <point name="center" x="{x}" y="{radius}" z="{z}"/> <float name="radius" value="{radius}"/>
     <bsdf type="roughplastic">
-        <rgb name="diffuse_reflectance" value="0.5, 0.5, 0.5"/> <float name="alpha" value="0.1"/>
+        <rgb name="diffuse_reflectance" value="{colour}"/> <float name="alpha" value="{alpha}"/>
     </bsdf>
 </shape>
 </scene>"""
+
+
+BALL = ball(x=1.1, z=1.5, radius=0.35, colour="0.5, 0.5, 0.5", alpha=0.1)
 HIDDEN = '<integrator type="path"> <boolean name="hide_emitters" value="true"/> </integrator>'
 SPP = 256
 SHOWN = 0.02, 0.98

@@ -51,13 +51,7 @@ PROFILES = {
     ],
 }
 """Radius and height of points on surfaces of revolution, so that their front is on the right upwards."""
-INSERTED = """<shape type="sphere">
-    <point name="center" x="1.1" y="0.2" z="-0.55"/> <float name="radius" value="0.2"/>
-    <bsdf type="roughplastic">
-        <rgb name="diffuse_reflectance" value="0.05, 0.25, 0.3"/> <float name="alpha" value="0.05"/>
-    </bsdf>
-</shape>
-</scene>"""
+INSERTED = insertion.ball(x=1.1, z=-0.55, radius=0.2, colour="0.05, 0.25, 0.3", alpha=0.05)
 PANEL = 225
 """Height of the rows of the contact sheet, pixels."""
 

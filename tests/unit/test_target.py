@@ -13,7 +13,6 @@ from envedit.core.errors import ConfigError, InputError
 from envedit.core.seeds import Seeds
 from envedit.images import images
 from envedit.scene import scene
-from envedit.solve import task
 from envedit.targets import initial_rendering, pixel_weights, target
 from tests.oracles.builders import BALL, LIGHT, SENSOR, exr, sky, write_scene
 from tests.oracles.users_scenes import HIDDEN
@@ -260,14 +259,13 @@ def test_pixels_of_a_picture_that_are_clipped_or_masked_do_not_count(ball, pictu
     values[2, 3:5], mask[1:7] = 255, 255
     file, masked = (str(png(tmp_path / name, v)) for name, v in (("a.png", values), ("m.png", mask)))
     clipped = of_a_picture(ball, pictured, file=file)
-    assert not clipped.weight[2, 3:5].any() and clipped.weight.sum() == SIZE[0] * SIZE[1] - 2
-    # But for Gauss-Newton steps, of which they are lower bounds.
-    assert clipped.clipped[2, 3:5].all() and clipped.clipped.sum() == 6
-    assert (task.likelihood(clipped).weight > 0).all()
+    known = clipped.known_weight
+    assert not known[2, 3:5].any() and known.sum() == SIZE[0] * SIZE[1] - 2
+    # But as lower bounds.
+    assert clipped.clipped[2, 3:5].all() and clipped.clipped.sum() == 6 and clipped.weight is None
     both = of_a_picture(ball, pictured, file=file, mask=masked)
-    assert both.weight.sum() == 6 * SIZE[1] - 2 and not both.weight[7:].any()
-    weight = task.likelihood(both).weight
-    assert (weight[1:7] > 0).all() and not weight[7:].any()
+    assert both.known_weight.sum() == 6 * SIZE[1] - 2 and not both.known_weight[7:].any()
+    assert both.weight[1:7].all() and not both.weight[7:].any()
     array = target.make(
         asking(kind="rendering", file=images.ARRAY), ball, pictured[0], pictured[1], mask[..., 0] / 255
     )
@@ -365,6 +363,10 @@ def test_paint_beside_the_object_does_not_count(tmp_path, rng):
     assert held.weight[~painted].sum() == pytest.approx(3 * held.weight[painted].sum(), rel=1e-5)
     with pytest.raises(InputError, match="no surface is seen"):
         target.make(asking(kind="strokes", strokes=(corner,)), ball, envmap)
+    # A white backdrop is no lower bound of anything.
+    file = str(png(tmp_path / "white.png", np.where(hidden[..., None], 255, 100).astype(np.uint8)))
+    backed = target.make(asking(kind="rendering", file=file), ball, envmap)
+    assert backed.clipped[hidden].all() and not backed.weight[hidden].any() and backed.weight[~hidden].all()
 
 
 def test_a_picture_of_the_scene_needs_a_file_or_an_array(ball, seen):

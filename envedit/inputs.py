@@ -15,7 +15,7 @@ from envedit.core.errors import ConfigError, InputError, NumericalError
 from envedit.core.primaries import Chromaticities
 from envedit.core.radiance import BRIGHTEST, require_radiance
 from envedit.core.rows import Rows
-from envedit.images import analytic_sky, images
+from envedit.images import analytic_sky, images, map_regions
 from envedit.representations.layers import unclip
 from envedit.representations.layers.placed_lights import PlacedLights, missing
 from envedit.scene import scene as scenes
@@ -62,6 +62,8 @@ class InputMap:
     unmoved: np.ndarray | None = None
     # (H, W, 3), what of :attr:`radiance` is of lights that ``[[input.lights]]`` locks
     locked: np.ndarray | None = None
+    # (H, W), how far ``[[input.regions]]`` keep a texel of :attr:`radiance`, 0 to 1; None: nowhere
+    kept: np.ndarray | None = None
     half: bool = False  # whether the file is OpenEXR in half
     unclipped: str = ""  # what was done about a clipped sun, a clause; "" where that was not asked for
 
@@ -203,16 +205,18 @@ def read_map(
 
 
 def _by_hand(settings, input_map):
-    """Return a map with its lights placed and turned as ``lights`` and ``rotate_degrees`` ask."""
-    if not settings.lights and not settings.rotate_degrees:
+    """Return a map as ``lights``, ``regions`` and ``rotate_degrees`` ask, in this order."""
+    if not settings.lights and not settings.regions and not settings.rotate_degrees:
         return input_map
-    stored = input_map.stored
     placed = locked = None
+    radiance = input_map.radiance
     warnings = [*input_map.warnings]
-    if settings.lights:
-        placed = PlacedLights(input_map.radiance, settings.horizon)
-        stored = input_map.as_stored(placed.place(settings.lights))
-        locked = placed.locked(settings.lights)
+    kept = map_regions.kept(settings.regions, *radiance.shape[:2])
+    if settings.lights or kept is not None:
+        placed = PlacedLights(radiance, settings.horizon)
+        lights = placed.locking(settings.lights, kept)
+        radiance = placed.place(lights)
+        locked = placed.locked(lights, settings.regions)
         locked = None if locked is None else latlong.rotate(locked, settings.rotate_degrees)
         if lacking := missing(settings.lights, len(placed.lights)):
             count = len(placed.lights)
@@ -220,9 +224,16 @@ def _by_hand(settings, input_map):
             entries = "entry is" if len(lacking) == 1 else "entries are"
             numbers = ", ".join(map(str, lacking))
             warnings.append(f"input.lights: got light = {numbers}, but {lights}; the {entries} ignored")
-    turned = latlong.rotate(stored, settings.rotate_degrees)
-    unmoved = input_map.radiance
-    return replace(input_map, stored=turned, warnings=warnings, placed=placed, unmoved=unmoved, locked=locked)
+    radiance = map_regions.changed(radiance, settings.regions)
+    return replace(
+        input_map,
+        stored=latlong.rotate(input_map.as_stored(radiance), settings.rotate_degrees),
+        warnings=warnings,
+        placed=placed,
+        unmoved=input_map.radiance,
+        locked=locked,
+        kept=None if kept is None else latlong.rotate(kept, settings.rotate_degrees),
+    )
 
 
 def read_file(source: str | np.ndarray, width: int | None, settings: config.Input, scale: float) -> InputMap:

@@ -17,6 +17,7 @@ from envedit.config.input_schema import Target
 from envedit.config.key_validators import Kelvin
 from envedit.config.light_schema import LightList
 from envedit.config.method_schema import Solve
+from envedit.config.region_schema import RegionList
 from envedit.config.stroke_schema import StrokeList
 from envedit.config.validators import Choice, Number, String, WantedError, show
 from envedit.core.errors import ConfigError
@@ -47,8 +48,8 @@ class Document:
     ----------
     strokes : tuple of dict
         As in ``[[target.strokes]]``.
-    lights : tuple of dict
-        As in ``[[input.lights]]``.
+    lights, regions : tuple of dict
+        As in ``[[input.lights]]`` and ``[[input.regions]]``.
     rotate_degrees : float
         ``[input] rotate_degrees``.
     exposure, temperature : float
@@ -61,6 +62,7 @@ class Document:
 
     strokes: tuple[dict, ...] = ()
     lights: tuple[dict, ...] = ()
+    regions: tuple[dict, ...] = ()
     rotate_degrees: float = 0.0
     exposure: float = 0.0
     temperature: float = 0.0
@@ -69,9 +71,9 @@ class Document:
 
     @property
     def placing(self) -> tuple:
-        """What decides where the lights of the map are before paint: not their names."""
+        """What decides what the map is before paint: not the names of its lights."""
         lights = [{key: value for key, value in light.items() if key != "name"} for light in self.lights]
-        return lights, self.rotate_degrees
+        return lights, self.regions, self.rotate_degrees
 
     def plain(self) -> dict:
         """Return it as JSON has it."""
@@ -81,6 +83,7 @@ class Document:
 _CHECKS = {
     "strokes": StrokeList(),
     "lights": LightList(),
+    "regions": RegionList(),
     "rotate_degrees": Number(-360, 360),
     "exposure": Number(-20, 20),
     "temperature": Kelvin(),

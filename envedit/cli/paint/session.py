@@ -37,7 +37,7 @@ from envedit.core.errors import ConfigError, InputError
 from envedit.core.seeds import Seeds
 from envedit.core.types import Views
 from envedit.export import adjustments, file_resolution
-from envedit.images import images
+from envedit.images import images, map_regions
 from envedit.losses import display_curve
 from envedit.losses.perceptual import installed
 from envedit.report import output_folder, run_folder
@@ -225,10 +225,19 @@ class Session:
         self.origin = self._by_hand(document)
         given = self.project.settings.input
         horizon = below_horizon.treatment(given.horizon, given.rows, self.origin)
-        locked = self.placed.locked(document.lights)
-        if locked is not None:
-            locked = latlong.rotate(locked, document.rotate_degrees)[self.rows.slice]
-        layers = Layers.of(self.origin[self.rows.slice], self.rows.place, horizon=horizon, fixed=locked)
+        kept = map_regions.kept(document.regions, *self.map.shape[:2])
+        locked = self.placed.locked(self.placed.locking(document.lights, kept), document.regions)
+        locked, kept = (
+            None if one is None else latlong.rotate(one, document.rotate_degrees) for one in (locked, kept)
+        )
+        self.kept = kept
+        layers = Layers.of(
+            self.origin[self.rows.slice],
+            self.rows.place,
+            horizon=horizon,
+            fixed=None if locked is None else locked[self.rows.slice],
+            kept=None if kept is None else kept[self.rows.slice],
+        )
         self.transport.resolve(self.origin, limit=COLUMNS)
         self.base = self.transport.apply(tensor(self.origin)).numpy()
         self.problem = map_problem.Problem(layers, self.transport, self.origin, self.base)
@@ -241,7 +250,8 @@ class Session:
         self._tell_lights()
 
     def _by_hand(self, document):
-        return latlong.rotate(self.placed.place(document.lights), document.rotate_degrees)
+        placed = map_regions.changed(self.placed.place(document.lights), document.regions)
+        return latlong.rotate(placed, document.rotate_degrees)
 
     def _drag(self):
         """Show the map with its lights placed, and what paint has added to it before."""
@@ -506,6 +516,7 @@ class Session:
             painted=self.coverage[..., 0],
             rendered=self.base,
             known=self.point.edited,
+            kept=self.kept,
         )
         self._tell_unreachable()
         self.tell_state()
@@ -582,8 +593,14 @@ class Session:
         self._tell_doing("composing the map at the resolution of its file")
         if self._wide is None:
             self._wide = self.given.at_file_size(settings, SKY_WIDTH)
-        by_hand = replace(settings, lights=document.lights, rotate_degrees=document.rotate_degrees)
-        given = replace(self.given, placed=self.placed if document.lights else None)
+        by_hand = replace(
+            settings,
+            lights=document.lights,
+            regions=document.regions,
+            rotate_degrees=document.rotate_degrees,
+        )
+        placed = self.placed if document.lights or document.regions else None
+        given = replace(self.given, placed=placed)
         params = self.problem.solution_params(self.run.state)
         edit = file_resolution.Found(self.problem.layers, params, None, 0.0, self.point.edited)
         _, carried = file_resolution.carried(by_hand, given, self._wide, edit, self.origin)

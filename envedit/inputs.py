@@ -220,10 +220,10 @@ def _by_hand(settings, input_map):
         locked = None if locked is None else latlong.rotate(locked, settings.rotate_degrees)
         if lacking := missing(settings.lights, len(placed.lights)):
             count = len(placed.lights)
-            lights = f"the map has {count} light{'s' if count != 1 else ''}"
+            known = f"the map has {count} light{'s' if count != 1 else ''}"
             entries = "entry is" if len(lacking) == 1 else "entries are"
             numbers = ", ".join(map(str, lacking))
-            warnings.append(f"input.lights: got light = {numbers}, but {lights}; the {entries} ignored")
+            warnings.append(f"input.lights: got light = {numbers}, but {known}; the {entries} ignored")
     radiance = map_regions.changed(radiance, settings.regions)
     return replace(
         input_map,

@@ -93,7 +93,8 @@ def _lights() -> str:
 
 
 def _regions() -> str:
-    rows = [[f"`{key}`", _values(region_schema.KEYS[key]), about] for key, about in region_schema.MEANINGS.items()]
+    keys = region_schema.KEYS
+    rows = [[f"`{key}`", _values(keys[key]), about] for key, about in region_schema.MEANINGS.items()]
     about = "A region has one shape: points or polygon; see [regions of the map](regions.md)."
     return f"### [[input.regions]]\n\n{about}\n\n{_table(['key', 'values', 'meaning'], rows)}"
 

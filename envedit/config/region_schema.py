@@ -60,8 +60,8 @@ MEANINGS = {
     "around it",
     "points": "middle line of a brush, directions of the map in degrees",
     "radius": "of the brush, degrees; only with points, and needed there",
-    "polygon": "corners of a region, joined by straight lines in the lat-long image; across its edge azimuths "
-    "go on below 0 or above 360",
+    "polygon": "corners of a region, joined by straight lines in the lat-long image; across its edge "
+    "azimuths go on below 0 or above 360",
     "softness": "degrees outside the border over which the change fades, at least a texel",
     "factor": "scale: factors on red, green and blue; needed",
 }
@@ -104,9 +104,7 @@ class RegionList(Check):
 def _region(name: str, region: dict[str, Any]) -> dict[str, Any]:
     for unknown in (key for key in region if key not in KEYS):
         raise ConfigError(f"{name}: has no key {show(unknown)}; {meant(unknown, KEYS)}")
-    found = {
-        key: named(f"{name}.{key}", check, region[key]) for key, check in KEYS.items() if key in region
-    }
+    found = {key: named(f"{name}.{key}", check, region[key]) for key, check in KEYS.items() if key in region}
     if "action" not in found:
         raise ConfigError(f"{name}.action: got none, expected one of {', '.join(ACTIONS)}")
     if ("points" in found) == ("polygon" in found):

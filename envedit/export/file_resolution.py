@@ -63,9 +63,10 @@ def carried(
 ) -> tuple[inputs.InputMap, np.ndarray]:
     """Carry an edit to the map as its file has it.
 
-    ``settings`` have the lights that were placed by hand, and the regions; ``input_map`` is the map at working size, ``own``
-    as the file has it, and ``initial`` (h, w, 3) the working map that was edited. Returns the map with its
-    lights placed, and its edit (H, W, 3), radiance before adjustments.
+    ``settings`` have the lights that were placed by hand, and the regions; ``input_map`` is the map at
+    working size, ``own`` as the file has it, and ``initial`` (h, w, 3) the working map that was edited.
+    Returns the map with its lights placed and its regions changed, and its edit (H, W, 3), radiance before
+    adjustments.
     """
     settings = _kept_lights_locked(settings, input_map)
     full = _by_hand(settings, input_map, own)

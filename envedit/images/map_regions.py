@@ -101,7 +101,7 @@ def _weights(region: Region, height: int, width: int) -> Iterator[tuple[slice, n
         else:
             inwards = _within_polygon(region["polygon"], (height, width), band)
         t = np.clip(1 + inwards / fade, 0, 1)
-        yield band, np.float32(t * t * (3 - 2 * t))
+        yield band, (t * t * (3 - 2 * t)).astype(np.float32)
 
 
 # ---- Shapes ------------------------------------------------------------------------------------------------

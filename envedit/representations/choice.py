@@ -57,7 +57,8 @@ def encoded(
 ) -> tuple[Representation, Params]:
     """Return an image (rows, W, 3) in the representation that a configuration asks for, and its parameters.
 
-    ``horizon``, ``fixed`` and ``kept`` are of layers alone (:meth:`.Layers.of`); the others are as for :func:`make`.
+    ``horizon``, ``fixed`` and ``kept`` are of layers alone (:meth:`.Layers.of`); the others are as for
+    :func:`make`.
     """
     if settings.representation.kind != "layers":
         fitted = make(settings, folder, progress, rows)

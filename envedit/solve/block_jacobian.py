@@ -84,7 +84,7 @@ class BlockJacobian:
 
     @functools.cached_property
     def sky(self) -> tuple[np.ndarray, np.ndarray]:
-        """Cells that lie in rows of the sky and may change: numbers of those in use, and directions (n, 3)."""
+        """Cells of the sky that may change: their numbers in use, and directions (n, 3)."""
         own = self._cell[: self._own]
         inside = np.bincount(own, self._changeable[: len(own)], self._cells)
         cells = np.flatnonzero(inside[self._used] > 0.5 * self._total[self._used])

@@ -100,8 +100,8 @@ class PlacedLights:
             at = self._toward(light)
             inside = False
             if at is not None:
-                row, column = latlong.texel_position(at, *kept.shape)
-                inside = kept[round(float(row)), round(float(column)) % kept.shape[1]] >= map_regions.KEPT_SHARE
+                row, column = (round(float(v)) for v in latlong.texel_position(at, *kept.shape))
+                inside = kept[row, column % kept.shape[1]] >= map_regions.KEPT_SHARE
             if inside:
                 locked.append(light | {"locked": True})
             elif light in placed:

@@ -12,6 +12,7 @@ from envedit.cli.paint.protocol import Document, Pick
 from envedit.core import latlong
 from envedit.core.arrays import tensor
 from envedit.core.rows import Rows
+from envedit.representations.layers.oriented import oriented
 from envedit.representations.layers.placed_lights import PlacedLights, angles, direction, flux_of
 from envedit.scene import highlight, placement, shadow
 from envedit.scene.camera_paths import NoPlaceError
@@ -30,7 +31,7 @@ SAME_LIGHT = np.cos(np.radians(10.0))
 
 @dataclass(frozen=True)
 class Placed:
-    """A light as a document has it: direction (3,) in the turned map, flux (3,), and its entry."""
+    """A light as a document has it: direction (3,) in the rotated map, flux (3,), and its entry."""
 
     direction: np.ndarray
     flux: np.ndarray
@@ -47,9 +48,9 @@ def lights(placed: PlacedLights, document: Document) -> list[Placed]:
         found.append((where, placed.layers.lights.flux[i] * flux_of(entry), entry))
     added = [light for light in document.lights if "light" not in light]
     found += [((light["azimuth"], light["elevation"]), flux_of(light), light) for light in added]
-    turned = document.rotate_degrees
+    rotation = document.orientation.matrix
     return [
-        Placed(direction(azimuth - turned, elevation), flux, entry)
+        Placed(rotation @ direction(azimuth, elevation), flux, entry)
         for (azimuth, elevation), flux, entry in found
     ]
 
@@ -62,8 +63,8 @@ def index_of(listed: Sequence[Placed], toward: np.ndarray) -> int | None:
 
 def place(toward: np.ndarray, document: Document) -> dict[str, float]:
     """Return ``azimuth`` and ``elevation`` of an entry of the document whose light is to stand there."""
-    azimuth, elevation = angles(toward)
-    return {"azimuth": (azimuth + document.rotate_degrees) % 360, "elevation": elevation}
+    azimuth, elevation = angles(toward @ document.orientation.matrix)
+    return {"azimuth": azimuth, "elevation": elevation}
 
 
 class Picking:
@@ -150,7 +151,7 @@ class Picking:
 
     def _lit_by(self, seen, document):
         """Return the index of the light of the document that adds most at a pixel; -1 without lights."""
-        degrees, best, most = document.rotate_degrees, -1, 0.0
+        best, most = -1, 0.0
         dark = [{**light, "flux": [0.0] * 3} for light in document.lights if "light" in light]
         named = {light["light"] for light in dark}
         dark += [{"light": i + 1, "flux": [0.0] * 3, "size": 1.0} for i in range(len(self.placed.lights))
@@ -165,7 +166,7 @@ class Picking:
             else:
                 gone = added[i - len(self.placed.lights)]
                 without = self.placed.place([one for one in document.lights if one is not gone])
-            lost = latlong.rotate(whole - without, degrees).mean(axis=2)
+            lost = oriented(whole - without, document.orientation, []).mean(axis=2)
             share = float((seen * lost).sum())
             if share > most:
                 best, most = i, share

@@ -4,6 +4,7 @@ import { Compare } from "./compare.js";
 import { Connection } from "./connection.js";
 import { accelerated, Display } from "./display.js";
 import { EMPTY, History } from "./history.js";
+import { Level } from "./level.js";
 import { LightList } from "./light_list.js";
 import { Lights, linear } from "./lights.js";
 import { Strokes } from "./strokes.js";
@@ -28,6 +29,7 @@ const PICKS = {
   move: ["highlight"], "move-shadow": ["shadow"], illuminate: ["illuminate", "illuminates this place"],
   rim: ["rim", "lights the rim from this place on"], cast: ["cast", "casts a shadow here"],
 };
+const ORIENTATION = [["degrees", "rotate_degrees"], ["tilt", "tilt_degrees"], ["horizon", "horizon_degrees"]]; // numbers, and their keys
 const AMOUNTS = { light: [2, 0.6], shadow: [1, 0.6], contrast: [4, 1.6] }; // largest, and what is chosen
 const frames = { render: [], map: [], difference: [], unreachable: [], before: [], photograph: [], explanation: [] }; // the last of each view
 
@@ -378,6 +380,18 @@ const lights = new Lights($("map-stack"), $("handles"), {
   drawn: (all) => listed.draw(all),
 });
 const listed = new LightList($("light-list"), lights);
+const level = new Level($("map-stack"), $("level-line"), $("level"), {
+  document: () => history.document,
+  preview(change) {
+    lights.draft = { ...history.document, ...change };
+    history.preview(change, "dragging");
+    lights.draw();
+    level.draw(lights.draft);
+    orient(lights.draft);
+  },
+  done: (change) => history.push(change),
+});
+$("level").addEventListener("click", () => { $("level-degrees").hidden = $("level-hint").hidden = $("level-line").hidden; });
 
 // ---- controls
 
@@ -390,7 +404,7 @@ function refresh() {
     frames.unreachable = [];
     $("unreachable").parentElement.hidden = true;
   }
-  $("degrees").value = now.rotate_degrees;
+  orient(now);
   $("map-exposure").value = now.exposure;
   $("map-temperature").value = now.temperature;
   $("map-exposure-slide").value = now.exposure;
@@ -400,8 +414,13 @@ function refresh() {
   valued($("freedom"));
   lights.draft = null;
   lights.draw();
+  level.draw();
   strokes.draw();
   compare.draw();
+}
+
+function orient(document) {
+  for (const [id, key] of ORIENTATION) $(id).value = document[key];
 }
 
 function choose(name, value) {
@@ -456,7 +475,7 @@ $("size").addEventListener("input", () => strokes.draw());
 $("outlines").addEventListener("click", outline);
 $("help").addEventListener("click", () => $("keys").showModal());
 $("keys-close").addEventListener("click", () => $("keys").close());
-for (const [id, key] of [["degrees", "rotate_degrees"], ["map-exposure", "exposure"], ["map-temperature", "temperature"]]) {
+for (const [id, key] of [...ORIENTATION, ["map-exposure", "exposure"], ["map-temperature", "temperature"]]) {
   $(id).addEventListener("change", () => {
     const value = Number($(id).value);
     if (!$(id).checkValidity() || !Number.isFinite(value) || (key === "temperature" && value && value < 2000)) {
@@ -501,6 +520,7 @@ window.addEventListener("keydown", (event) => {
   } else if (key === "b" && !event.repeat) displays.render.set({ split: 1 });
   else if (key === "o" && !event.repeat) outline();
   else if (key === "m") compare.large();
+  else if (key === "l") $("level").click();
   else if (key === "a") compare.keep();
   else if (key === "h") compare.toggle();
   else if (key === "+" || key === "-") zooms[0].by(key === "+" ? 1.2 : 1 / 1.2);

@@ -154,6 +154,7 @@ def test_keys_that_cannot_be_are_named():
         ({"light": 1, "flux": [1, 1, 2e6]}, "flux"),
         ({"flux": [1, 1, 1]}, "azimuth"),
         ({"light": 1, "sise": 2}, "did you mean size"),
+        ({"light": 1, "role": "backlight"}, r"lights\[0\].role.*key"),
         ({"light": 1, "shape": "disc"}, "has no key 'shape'"),
         ({"azimuth": 1, "elevation": 2, "flux": [1, 1, 1], "shape": "discs"}, "shape.*did you mean disc"),
         ({"azimuth": 1, "elevation": 2, "flux": [1, 1, 1], "softness": np.nan}, r"lights\[0\].softness"),

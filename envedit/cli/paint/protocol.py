@@ -39,6 +39,11 @@ _LARGEST = 65504.0
 _FAR = 1e30
 
 
+def unchanged(number: int | None) -> dict[str, Any]:
+    """Return the entry of a light of the map, by its number, that is as the map has it."""
+    return {"light": number, "flux": [1.0] * 3, "size": 1.0}
+
+
 class BadMessageError(ValueError):
     """A message that is refused; the text says why."""
 
@@ -75,9 +80,13 @@ class Document:
 
     @property
     def placing(self) -> tuple:
-        """What decides where the lights of the map are before paint: not their names."""
-        lights = [{key: value for key, value in light.items() if key != "name"} for light in self.lights]
-        return lights, self.orientation
+        """What decides where the lights of the map are before paint: not their names, roles and order."""
+        lights = [
+            {key: value for key, value in light.items() if key not in ("name", "role")}
+            for light in self.lights
+        ]
+        changed = [light for light in lights if light != unchanged(light.get("light"))]
+        return sorted(json.dumps(light, sort_keys=True) for light in changed), self.orientation
 
     @property
     def orientation(self) -> Orientation:

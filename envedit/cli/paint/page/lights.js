@@ -28,7 +28,8 @@ export class Lights {
     this.draw();
   }
 
-  // All lights as they are: {entry, own, azimuth, elevation, factor}, the map's own first.
+  // All lights as they are: {entry, own, azimuth, elevation, factor}, the map's own first, by their numbers. Where each
+  // of these has an entry in the document, the order is that of the entries (picking.lights of the server is the same).
   list(document = this.draft ?? this.on.document()) {
     const own = this.own.map((light) => {
       const entry = document.lights.find((one) => one.light === light.light) ?? { light: light.light, flux: [1, 1, 1], size: 1 };
@@ -36,18 +37,37 @@ export class Lights {
       return { entry, own: light, azimuth, elevation };
     });
     const added = document.lights.filter((one) => !one.light).map((entry) => ({ entry, own: null, azimuth: entry.azimuth, elevation: entry.elevation }));
-    return [...own, ...added];
+    const all = [...own, ...added], at = (light) => document.lights.indexOf(light.entry);
+    return all.every((light) => at(light) >= 0) ? all.sort((a, b) => at(a) - at(b)) : all;
   }
 
   get unit() { return this.own.length ? Math.max(...this.own[0].flux, 1e-6) : 1; }
 
-  // The document's lights with one of them changed, or left out (null).
+  // The document's lights with one of them changed, or left out (null), in the order of the list.
   changed(index, change) {
-    const document = this.on.document(), light = this.list(document)[index];
-    if (!light) return null;
-    const next = change && { ...light.entry, ...change };
-    if (light.own) return [...document.lights.filter((one) => one.light !== light.entry.light), ...(next ? [next] : [])];
-    return document.lights.flatMap((one) => (one === light.entry ? (next ? [next] : []) : [one]));
+    const { lights } = this.on.document(), all = this.list(this.on.document());
+    if (!all[index]) return null;
+    const entries = all.flatMap(({ entry }, i) => {
+      if (i === index) return change ? [{ ...entry, ...change }] : [];
+      return lights.includes(entry) ? [entry] : [];
+    });
+    return [...entries, ...this.unlisted()];
+  }
+
+  // Entries of lights that the map does not have.
+  unlisted() {
+    const all = this.list(this.on.document());
+    return this.on.document().lights.filter((one) => !all.some(({ entry }) => entry === one));
+  }
+
+  // Change the place of a light in the list; says whether it has another one now.
+  reorder(index, by) {
+    const entries = this.list().map(({ entry }) => entry), to = index + by;
+    if (!entries[to]) return false;
+    entries.splice(to, 0, ...entries.splice(index, 1));
+    this.chosen = to;
+    this.on.done({ lights: [...entries, ...this.unlisted()] });
+    return true;
   }
 
   preview(index, change) {
@@ -243,7 +263,7 @@ export class Lights {
       const muted = off(light);
       handle.classList.toggle("muted", muted);
       handle.setAttribute("aria-pressed", String(i === this.chosen));
-      handle.setAttribute("aria-label", `${light.own ? "Light" : "Added light"} ${i + 1}${light.entry.name ? `, ${light.entry.name}` : ""}: azimuth ${light.azimuth.toFixed(0)}, elevation ${light.elevation.toFixed(0)} degrees${muted ? ", muted" : ""}; arrow keys move it`);
+      handle.setAttribute("aria-label", `${light.own ? "Light" : "Added light"} ${i + 1}${light.entry.name ? `, ${light.entry.name}` : ""}${light.entry.role ? `, ${light.entry.role} light` : ""}: azimuth ${light.azimuth.toFixed(0)}, elevation ${light.elevation.toFixed(0)} degrees${muted ? ", muted" : ""}; arrow keys move it`);
       place(handle, seen(document, light));
     });
     this.holder.querySelectorAll(".found").forEach((ring) => ring.remove());

@@ -1,4 +1,4 @@
-"""Lights moved, changed or added by hand before an edit, and the map levelled: ``[input]`` and ``[[input.lights]]``."""
+"""Lights moved, changed or added by hand before an edit, and the map rotated: ``[input]``."""
 
 import numpy as np
 import pytest

@@ -247,11 +247,19 @@ def _continued(project):
 
 
 def recent() -> list[dict]:
-    """List what was painted lately, the last first: ``path`` of ``painted.toml``, ``title``."""
+    """List what was painted lately, the last first: ``path`` of ``painted.toml``, ``title``, ``picture``.
+
+    That is the rendering that was saved, "" where none was.
+    """
     with contextlib.suppress(OSError, ValueError, TypeError, KeyError, AttributeError):
         listed = json.loads(_recent_file().read_text(encoding="utf-8"))
         found = [{"path": str(one["path"]), "title": str(one["title"])} for one in listed]
-        return [one for one in found if Path(one["path"]).is_file()][:_RECENT]
+        there = [one for one in found if Path(one["path"]).is_file()][:_RECENT]
+        pictures = [Path(one["path"]).with_name("render_edited.exr") for one in there]
+        return [
+            one | {"picture": str(picture) if picture.is_file() else ""}
+            for one, picture in zip(there, pictures, strict=True)
+        ]
     return []
 
 

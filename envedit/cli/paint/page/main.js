@@ -1,5 +1,6 @@
 // The page: what is sent when, and what is shown where.
 
+import { Chooser } from "./chooser.js";
 import { Compare } from "./compare.js";
 import { Connection } from "./connection.js";
 import { accelerated, Display } from "./display.js";
@@ -165,9 +166,7 @@ const RECEIVED = {
   start(message) {
     if (opened) return;
     $("start").hidden = false;
-    list($("shipped"), message.scenes.map((name) => [name, name]));
-    list($("edits"), message.configurations.map((name) => [name, name.replace(/.*\//, "").replaceAll("_", " ")]));
-    list($("recent"), message.recent.map((one) => [one.path, `${one.title}, in ${one.path.split(/[\\/]/).slice(-3, -1).join("/")}`]));
+    chooser.offer(message);
     $("names").replaceChildren(...message.scenes.concat(message.configurations).map((name) => Object.assign(document.createElement("option"), { value: name })));
     state("ready", "Choose what to paint on");
   },
@@ -196,6 +195,7 @@ const RECEIVED = {
     say(message.again && !message.notes.length ? `Goes on from painted.toml of ${message.folder}` : message.notes.join("; "), true);
     refresh();
   },
+  thumbnail(message) { if (!opened) chooser.picture(message); },
   document(message) { history.follow({ ...EMPTY, ...message.document }, !message.client); refresh(); },
   lights(message) { lights.set(message); },
   explanations(message) { explain(message); },
@@ -270,16 +270,6 @@ function state(name, text) {
 function say(text, good = false) {
   $("message").textContent = text ?? "";
   $("message").classList.toggle("good", good);
-}
-
-function list(holder, entries) {
-  holder.replaceChildren(...entries.map(([name, text]) => {
-    const item = document.createElement("li"), button = document.createElement("button");
-    button.textContent = text;
-    button.addEventListener("click", () => open(name));
-    item.append(button);
-    return item;
-  }));
 }
 
 // ---- painting
@@ -544,6 +534,7 @@ window.addEventListener("resize", () => { for (const one of Object.values(displa
 
 // ---- start page
 
+const chooser = new Chooser($("open-map"), open);
 function open(name, envmap = $("open-map").value.trim()) {
   say("");
   state("loading", `Opening ${name}`);
@@ -556,7 +547,7 @@ async function upload(file) {
   const answer = await fetch(`map/${encodeURIComponent(file.name)}`, { method: "PUT", body: file });
   const text = await answer.text();
   if (!answer.ok) { say(text); state("ready", "Choose what to paint on"); return; }
-  $("open-map").value = text;
+  chooser.choose(text);
   $("open-name").value ||= "sphere";
   state("ready", "Choose what to paint on");
 }

@@ -32,7 +32,8 @@ MOST_MAPS = 24
 """Maps that are offered, those written last."""
 ENDINGS = (".exr", ".hdr")
 MEMORY = 2**31
-"""Address space for reading, beside the program's: a map of 8192 x 4096 takes 1.0 GB, a larger one has no picture."""
+"""Address space for reading, beside the program's: a map of 8192 x 4096 takes 1.0 GB; one that takes more
+than this has no picture."""
 
 
 def maps(folders: Sequence[Path]) -> list[Path]:

@@ -17,6 +17,7 @@ from envedit.core.radiance import BRIGHTEST, require_radiance
 from envedit.core.rows import Rows
 from envedit.images import analytic_sky, images
 from envedit.representations.layers import unclip
+from envedit.representations.layers.oriented import oriented
 from envedit.representations.layers.placed_lights import PlacedLights, missing
 from envedit.scene import scene as scenes
 from envedit.scene import supported
@@ -58,7 +59,7 @@ class InputMap:
     # The map as the file has it, where lights of it were placed by hand; ``stored`` has them placed
     placed: PlacedLights | None = None
     array: np.ndarray | None = None  # (H, W, 3), the whole map, where it came as an array and not from a file
-    # (H, W, 3), the :attr:`radiance` of the file, where lights were placed or the map was turned by hand
+    # (H, W, 3), the :attr:`radiance` of the file, where lights were placed or the map was rotated by hand
     unmoved: np.ndarray | None = None
     # (H, W, 3), what of :attr:`radiance` is of lights that ``[[input.lights]]`` locks
     locked: np.ndarray | None = None
@@ -203,8 +204,8 @@ def read_map(
 
 
 def _by_hand(settings, input_map):
-    """Return a map with its lights placed and turned as ``lights`` and ``rotate_degrees`` ask."""
-    if not settings.lights and not settings.rotate_degrees:
+    """Return a map with its lights placed as ``lights`` ask, then rotated as a whole."""
+    if not settings.lights and not any(settings.orientation):
         return input_map
     stored = input_map.stored
     placed = locked = None
@@ -213,16 +214,16 @@ def _by_hand(settings, input_map):
         placed = PlacedLights(input_map.radiance, settings.horizon)
         stored = input_map.as_stored(placed.place(settings.lights))
         locked = placed.locked(settings.lights)
-        locked = None if locked is None else latlong.rotate(locked, settings.rotate_degrees)
+        locked = None if locked is None else oriented(locked, settings.orientation)
         if lacking := missing(settings.lights, len(placed.lights)):
             count = len(placed.lights)
             lights = f"the map has {count} light{'s' if count != 1 else ''}"
             entries = "entry is" if len(lacking) == 1 else "entries are"
             numbers = ", ".join(map(str, lacking))
             warnings.append(f"input.lights: got light = {numbers}, but {lights}; the {entries} ignored")
-    turned = latlong.rotate(stored, settings.rotate_degrees)
-    unmoved = input_map.radiance
-    return replace(input_map, stored=turned, warnings=warnings, placed=placed, unmoved=unmoved, locked=locked)
+    rotated = oriented(stored, settings.orientation)
+    changed = replace(input_map, stored=rotated, warnings=warnings, placed=placed)
+    return replace(changed, unmoved=input_map.radiance, locked=locked)
 
 
 def read_file(source: str | np.ndarray, width: int | None, settings: config.Input, scale: float) -> InputMap:

@@ -13,6 +13,7 @@ from envedit.core.rows import Rows
 from envedit.export import adjustments, full_resolution
 from envedit.representations import Layers, Representation
 from envedit.representations.layers import placed_lights
+from envedit.representations.layers.oriented import oriented
 
 if TYPE_CHECKING:
     from envedit import results
@@ -88,7 +89,7 @@ def carried(
 
 
 def _by_hand(settings: config.Input, input_map: inputs.InputMap, own: inputs.InputMap) -> inputs.InputMap:
-    """Place and turn the lights of the map as the file has it as it was done at working size."""
+    """Place the lights of the map, and rotate it, as the file has it as it was done at working size."""
     full = own
     if input_map.placed is not None:
         placed = input_map.placed
@@ -101,4 +102,4 @@ def _by_hand(settings: config.Input, input_map: inputs.InputMap, own: inputs.Inp
             )
         moved = placed_lights.add(moved, [light for light in settings.lights if "light" not in light])
         full = replace(full, stored=full.as_stored(moved))
-    return replace(full, stored=latlong.rotate(full.stored, settings.rotate_degrees))
+    return replace(full, stored=oriented(full.stored, settings.orientation))

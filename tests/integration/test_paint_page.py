@@ -10,8 +10,10 @@ import pytest
 
 from envedit import config, pipeline
 from envedit.core.color import luminance
+from envedit.core.rotations import Orientation
 from envedit.core.tone_curves import TONE_CURVES
-from envedit.images import images
+from envedit.images import analytic_sky, images
+from envedit.representations.layers.placed_lights import angles, direction
 from envedit.targets.strokes import gains
 from tests.oracles.builders import LIGHT, write_scene
 from tests.oracles.painting import OF_TWO, SMALL, TWO_VIEWS, photographed, served, until
@@ -408,6 +410,93 @@ def test_lights_listed_states_compared_the_map_large_and_zoom(browser, tmp_path)
         states_are_compared(page, kept)
         map_is_large_and_rendering_zoomed(page)
         tones_are_those_of_the_package(page)
+        assert not page.faults, page.faults
+
+
+def map_is_levelled(page, kept, session):
+    """The horizon by the line's grips, keys and numbers: the handle of a light goes along."""
+    get = page.page.get_by_test_id
+
+    def orientation():
+        return tuple(config.load(kept).input.orientation) if kept.exists() else None
+
+    page.page.keyboard.press("l")
+    grip = get("grip-tilt").bounding_box()
+    x, y = grip["x"] + grip["width"] / 2, grip["y"] + grip["height"] / 2
+    height = page.page.locator("#map-stack").bounding_box()["height"]
+    page.drag((x, y), (x, y - height / 10))
+    until(lambda: orientation() == (0, pytest.approx(-18, abs=0.5), 0))
+    get("grip-horizon").press("Shift+ArrowUp")
+    get("tilt").fill("12")
+    get("tilt").press("Enter")
+    get("degrees").fill("100")
+    get("degrees").press("Enter")
+    until(lambda: orientation() == (100, 12, 5))
+    toward = Orientation(100, 12, 5).matrix @ session.placed.lights[0].direction
+    azimuth, elevation = angles(toward)
+    box, at = (page.page.locator(name).bounding_box() for name in ("#map-stack", "[data-testid=handle-1]"))
+    seen = at["x"] + at["width"] / 2 - box["x"], at["y"] + at["height"] / 2 - box["y"]
+    expected = azimuth / 360 * box["width"], (90 - elevation) / 180 * box["height"]
+    assert seen == pytest.approx(expected, abs=1)
+    # ---- A key moves a light on the map as it is seen
+    get("handle-1").press("ArrowRight")
+    until(lambda: config.load(kept).input.lights)
+    (light,) = config.load(kept).input.lights
+    moved = angles(Orientation(100, 12, 5).matrix @ direction(light["azimuth"], light["elevation"]))
+    assert moved == pytest.approx((azimuth + 1, elevation), abs=0.05)
+    page.shot("level")
+    assert not page.page.evaluate(UNNAMED)
+    assert not page.page.evaluate(FAINT)
+    get("undo").click()
+    get("undo").click()
+    until(lambda: orientation() == (0, 12, 5))
+
+
+def lights_are_ordered(page, kept):
+    """Roles, and the order of the list by buttons and keys."""
+    get = page.page.get_by_test_id
+
+    def lights():
+        return [(one.get("light"), one.get("role")) for one in config.load(kept).input.lights]
+
+    get("add-light").click()
+    get("list-role-2").select_option("rim")
+    until(lambda: lights() == [(None, "rim")])
+    get("list-up-2").click()
+    until(lambda: lights() == [(None, "rim"), (1, None)])
+    sync_api.expect(get("list-name-1")).to_have_attribute("placeholder", "added")
+    sync_api.expect(get("handle-1")).to_have_attribute("aria-pressed", "true")
+    sync_api.expect(get("list-choose-1")).to_be_focused()  # its button, as it cannot go up further
+    get("list-role-2").select_option("key")
+    get("list-choose-2").press("Alt+ArrowUp")
+    until(lambda: lights() == [(1, "key"), (None, "rim")])
+    sync_api.expect(get("list-choose-1")).to_be_focused()
+
+
+def test_a_map_is_chosen_and_levelled_and_its_lights_are_ordered(browser, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "edit.toml").write_text(SMALL)
+    images.write_exr("sky.exr", analytic_sky.sunsky(64, 200, 30, 3), {})
+    images.write_exr("picture.exr", np.ones((30, 40, 3)), panorama=False)
+    kept = tmp_path / "edit_out" / "painted.toml"
+    with served(None) as server:
+        page = Page(browser, server.url)
+        tile = page.page.get_by_role("button", name="sky.exr")
+        sync_api.expect(tile.locator("img")).to_have_attribute("src", re.compile("^data:image/png"))
+        sync_api.expect(page.page.get_by_role("button", name="picture.exr")).to_be_hidden()
+        shown = "() => [...document.querySelectorAll('.tiles img[src]')].every((e) => e.naturalWidth > 0)"
+        page.page.wait_for_function(shown)
+        tile.click()
+        sync_api.expect(tile).to_have_attribute("aria-pressed", "true")
+        page.shot("start")
+        assert not page.page.evaluate(UNNAMED)
+        assert not page.page.evaluate(FAINT)
+        page.page.get_by_test_id("open-name").fill("edit.toml")
+        page.page.get_by_test_id("open").click()
+        page.page.wait_for_function("() => envedit.log.some((e) => e.frame)")
+        map_is_levelled(page, kept, server.worker.session)
+        assert config.load(kept).input.envmap == str(tmp_path / "sky.exr")
+        lights_are_ordered(page, kept)
         assert not page.faults, page.faults
 
 

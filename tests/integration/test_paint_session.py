@@ -132,13 +132,14 @@ def test_a_shadow_is_dragged_by_its_tip(painting):
         return heard.last["picked"]
 
     for turn, (tip, there) in DRAGGED.items():
-        session.update(Edit(document({"rotate_degrees": turn})))
+        level = {"rotate_degrees": turn, "tilt_degrees": 3.0}
+        session.update(Edit(document(level)))
         before = session.base[:, :, 1].copy()
         found = picked(*tip)
         assert found["light"] == 0 and len(found["point"]) == 3
         to = picked(*there, light=0, point=tuple(found["point"]))
         light = {"light": 1, "azimuth": to["azimuth"], "elevation": to["elevation"]}
-        session.update(Edit(document({"rotate_degrees": turn, "lights": [light]})))
+        session.update(Edit(document(level | {"lights": [light]})))
         after = session.base[:, :, 1]
         assert after[there] < 0.5 * before[there], "the shadow is not where it was dragged to"
         assert after[tip] > before[tip]
@@ -146,7 +147,7 @@ def test_a_shadow_is_dragged_by_its_tip(painting):
         # ---- A click does the same with the strongest light; to illuminate, one is to be added
         to = picked(*tip, of="cast")
         light |= {"azimuth": to["azimuth"], "elevation": to["elevation"]}
-        session.update(Edit(document({"rotate_degrees": turn, "lights": [light]})))
+        session.update(Edit(document(level | {"lights": [light]})))
         assert to["light"] == 0 and session.base[tip][1] < 0.5 * after[tip], "the shadow does not fall there"
         added = picked(20, 24, of="illuminate")
         assert added["light"] == -1 and -90 <= added["elevation"] <= 90

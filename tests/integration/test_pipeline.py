@@ -16,9 +16,11 @@ import pytest
 from envedit import api, config, inputs, pipeline
 from envedit.core import color, interrupts, latlong
 from envedit.core.errors import InputError
+from envedit.core.rotations import Orientation
 from envedit.images import analytic_sky, images
 from envedit.losses.perceptual import installed
 from envedit.representations.layers import gain
+from envedit.representations.layers.placed_lights import angles, direction
 from envedit.scene import scene
 from envedit.solve import (
     adam_loop,
@@ -838,7 +840,11 @@ def test_a_turned_sky_is_turned_back_to_the_bit(kind, tmp_path, rng):
 def test_lights_before_are_those_of_the_file(tmp_path, rng):
     """Not as they were placed and turned by hand, which is part of how far they have moved."""
     moved = {"light": 1, "azimuth": 200.0, "elevation": 40.0}
-    for by_hand, azimuth in (({"rotate_degrees": 90.0}, 360 * 9.5 / 32 - 90), ({"lights": [moved]}, 200)):
+    levelled, _ = angles(Orientation(horizon=-10.0).matrix @ direction(200.0, 40.0))
+    for by_hand, azimuth in (
+        ({"rotate_degrees": 90.0}, 360 * 9.5 / 32 - 90),
+        ({"lights": [moved], "horizon_degrees": -10.0}, levelled),
+    ):
         settings, _ = turned_world(tmp_path, rng, target={"kind": "none"}, input=by_hand)
         found = pipeline.run(settings)
         (before,), (after,) = (found.lights[name] for name in ("before", "after"))

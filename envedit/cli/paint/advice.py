@@ -214,14 +214,9 @@ def _placed(problem, start, state, painted, listed, document):
         away = problem.direction(state, strongest)
         share, toward, factor = _best(problem, dark, start, strongest, painted, away)
         if toward is not None:
-            entry = listed[i].entry
-            flux = [factor * value for value in entry["flux"]]
-            others = [light for light in document.lights if light is not entry]
-            yield (
-                share,
-                f"Drag light {i + 1}",
-                [*others, entry | {"flux": flux} | picking.place(toward, document)],
-            )
+            flux = [factor * value for value in listed[i].entry["flux"]]
+            moved = {"flux": flux} | picking.place(toward, document)
+            yield share, f"Drag light {i + 1}", picking.changed(listed, i, moved, document)
     # ---- One more
     spare, size = layers.own, layers.log_size(LOBE_DEGREES)
     lobe = _with(start, spare, size=size)

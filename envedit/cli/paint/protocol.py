@@ -17,9 +17,11 @@ from envedit.config.input_schema import Target
 from envedit.config.key_validators import Kelvin
 from envedit.config.light_schema import LightList
 from envedit.config.method_schema import Solve
+from envedit.config.schema import FIELDS
 from envedit.config.stroke_schema import StrokeList
 from envedit.config.validators import Choice, Number, String, WantedError, show
 from envedit.core.errors import ConfigError
+from envedit.core.rotations import Orientation
 
 MOST_BYTES = 1 << 20
 """Length of a message from the page."""
@@ -28,11 +30,18 @@ MOST_STROKES, MOST_POINTS = 500, 20_000
 KINDS = (
     "render", "map", "difference", "unreachable", "before", "explanation", "sky", "sky-before", "photograph",
 )  # fmt: skip
+ORIENTATION = ("rotate_degrees", "tilt_degrees", "horizon_degrees")
+"""Keys of ``[input]`` that a document has, in the order of :class:`.Orientation`."""
 SOURCES = ("transport", "mitsuba", "saved")
 PHASES = ("drawing", "dragging", "done")
 """A stroke is being drawn, a light is being dragged, or neither."""
 _LARGEST = 65504.0
 _FAR = 1e30
+
+
+def unchanged(number: int | None) -> dict[str, Any]:
+    """Return the entry of a light of the map, by its number, that is as the map has it."""
+    return {"light": number, "flux": [1.0] * 3, "size": 1.0}
 
 
 class BadMessageError(ValueError):
@@ -49,8 +58,8 @@ class Document:
         As in ``[[target.strokes]]``.
     lights : tuple of dict
         As in ``[[input.lights]]``.
-    rotate_degrees : float
-        ``[input] rotate_degrees``.
+    rotate_degrees, tilt_degrees, horizon_degrees : float
+        As in ``[input]``.
     exposure, temperature : float
         As in ``[output]``.
     rest : str
@@ -62,6 +71,8 @@ class Document:
     strokes: tuple[dict, ...] = ()
     lights: tuple[dict, ...] = ()
     rotate_degrees: float = 0.0
+    tilt_degrees: float = 0.0
+    horizon_degrees: float = 0.0
     exposure: float = 0.0
     temperature: float = 0.0
     rest: str = Target.rest
@@ -69,9 +80,18 @@ class Document:
 
     @property
     def placing(self) -> tuple:
-        """What decides where the lights of the map are before paint: not their names."""
-        lights = [{key: value for key, value in light.items() if key != "name"} for light in self.lights]
-        return lights, self.rotate_degrees
+        """What decides where the lights of the map are before paint: not their names, roles and order."""
+        lights = [
+            {key: value for key, value in light.items() if key not in ("name", "role")}
+            for light in self.lights
+        ]
+        changed = [light for light in lights if light != unchanged(light.get("light"))]
+        return sorted(json.dumps(light, sort_keys=True) for light in changed), self.orientation
+
+    @property
+    def orientation(self) -> Orientation:
+        """How the map is rotated as a whole, after its lights are placed."""
+        return Orientation(self.rotate_degrees, self.tilt_degrees, self.horizon_degrees)
 
     def plain(self) -> dict:
         """Return it as JSON has it."""
@@ -81,7 +101,7 @@ class Document:
 _CHECKS = {
     "strokes": StrokeList(),
     "lights": LightList(),
-    "rotate_degrees": Number(-360, 360),
+    **{name: FIELDS["input"][name].metadata["check"] for name in ORIENTATION},
     "exposure": Number(-20, 20),
     "temperature": Kelvin(),
     "rest": Choice("follow", "keep"),

@@ -29,7 +29,7 @@ import numpy as np
 from envedit import inputs, pipeline, renderers
 from envedit.cli.paint import advice, picking
 from envedit.cli.paint.project import MATCHED, SOLUTION, Project
-from envedit.cli.paint.protocol import Document, Edit, Pick
+from envedit.cli.paint.protocol import ORIENTATION, Document, Edit, Pick
 from envedit.core import latlong
 from envedit.core.arrays import tensor
 from envedit.core.color import luminance, tonemap
@@ -43,6 +43,7 @@ from envedit.losses.perceptual import installed
 from envedit.report import output_folder, run_folder
 from envedit.representations.layers import below_horizon
 from envedit.representations.layers.layers import Layers
+from envedit.representations.layers.oriented import oriented
 from envedit.representations.layers.placed_lights import PlacedLights, angles
 from envedit.representations.layers.unseen import unseen_kept
 from envedit.scene.scene import Scene
@@ -220,14 +221,14 @@ class Session:
         self.tell.say({"type": "document", "client": client, "document": self.document.plain()})
 
     def _aim(self, document):
-        """Take lights and turn of a document for the map that is painted on."""
+        """Take lights and orientation of a document for the map that is painted on."""
         self.document, self._dragged = document, False
         self.origin = self._by_hand(document)
         given = self.project.settings.input
         horizon = below_horizon.treatment(given.horizon, given.rows, self.origin)
         locked = self.placed.locked(document.lights)
         if locked is not None:
-            locked = latlong.rotate(locked, document.rotate_degrees)[self.rows.slice]
+            locked = oriented(locked, document.orientation)[self.rows.slice]
         layers = Layers.of(self.origin[self.rows.slice], self.rows.place, horizon=horizon, fixed=locked)
         self.transport.resolve(self.origin, limit=COLUMNS)
         self.base = self.transport.apply(tensor(self.origin)).numpy()
@@ -240,8 +241,8 @@ class Session:
         self._paint()
         self._tell_lights()
 
-    def _by_hand(self, document):
-        return latlong.rotate(self.placed.place(document.lights), document.rotate_degrees)
+    def _by_hand(self, document, lights=None):
+        return oriented(self.placed.place(document.lights), document.orientation, lights)
 
     def _drag(self):
         """Show the map with its lights placed, and what paint has added to it before."""
@@ -249,7 +250,7 @@ class Session:
             self._quick.resolve(self.point.edited, limit=COLUMNS)
             self._still_quick = self._quick.apply(tensor(self.point.edited)).numpy()
         self._dragged, self.solving = True, False
-        origin = self._by_hand(self.document)
+        origin = self._by_hand(self.document, lights=[])  # to look for them takes longer than a frame
         found = np.maximum(origin + (self.point.edited - self.origin), 0).astype(np.float32)
         self._quick.probe(self._quick.bright_texels(found)[: min(DRAGGED_COLUMNS, self._quick.capacity)])
         changed = self._quick.apply(tensor(found)).numpy() - self._still_quick
@@ -582,7 +583,8 @@ class Session:
         self._tell_doing("composing the map at the resolution of its file")
         if self._wide is None:
             self._wide = self.given.at_file_size(settings, SKY_WIDTH)
-        by_hand = replace(settings, lights=document.lights, rotate_degrees=document.rotate_degrees)
+        rotated = {name: getattr(document, name) for name in ORIENTATION}
+        by_hand = replace(settings, lights=document.lights, **rotated)
         given = replace(self.given, placed=self.placed if document.lights else None)
         params = self.problem.solution_params(self.run.state)
         edit = file_resolution.Found(self.problem.layers, params, None, 0.0, self.point.edited)

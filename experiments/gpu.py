@@ -129,7 +129,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--variant", default="cuda_ad_rgb", help="Mitsuba variant (%(default)s)")
     parser.add_argument("--minutes", type=float, default=8.0, help="at most (%(default)s)")
     parser.add_argument("--small", action="store_true", help="tiny sizes, to test this program")
-    parser.add_argument("--steps", nargs="+", choices=STEPS, default=STEPS, metavar="STEP", help="these alone")
+    parser.add_argument("--steps", nargs="+", choices=STEPS, default=STEPS, metavar="STEP", help="these")
     given = parser.parse_args(argv)
     end = time.monotonic() + 60 * given.minutes
     steps: dict[str, dict[str, Any]] = {step: {} for step in given.steps}

@@ -69,8 +69,9 @@ def test_a_step_ends_with_all_that_it_has_started_when_the_time_is_over(tmp_path
 
 @pytest.mark.slow
 def test_the_script_measures_at_tiny_sizes(tmp_path):
-    """The commands of *doctor* and *engine* are run by other tests, that of *quickstart* is like *solver*'s."""
-    command = ["bash", ROOT / "experiments/gpu.sh", tmp_path / "gpu.json", "--small", "--steps", "solver", "fit"]
+    """Other tests run what *doctor* and *engine* do, and *quickstart* is as *solver*."""
+    script = ROOT / "experiments/gpu.sh"
+    command = ["bash", script, tmp_path / "gpu.json", "--small", "--steps", "solver", "fit"]
     own = {"PYTHON": sys.executable, "XDG_CACHE_HOME": str(tmp_path / "cache")}
     done = subprocess.run(
         [*command, "--variant", "llvm_ad_rgb"],

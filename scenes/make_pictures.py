@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 import envedit
-from envedit import config, inputs
+from envedit import inputs
 from envedit.cli import run
 from envedit.core import shipped
 from envedit.core.color import luminance, tonemap
@@ -34,11 +34,9 @@ def main() -> None:
     """Write all pictures."""
     mi.set_variant("llvm_ad_rgb")
     write("map-sunsky", envedit.sunsky(MAP_WIDTH))
-    for name in [*shipped.scenes(), *(one for one in shipped.configurations() if one.startswith("edits/"))]:
-        overrides = [f"scene.width={WIDTH}"]
-        if name == "mesh":  # a scene for any mesh
-            overrides += [f"scene.parameters.mesh={config.quote(str(shipped.folder() / 'statue.ply'))}"]
-        settings, _, _ = run.load(name, None, overrides)
+    edits = [name for name in shipped.configurations() if name.startswith("edits/")]
+    for name in [*shipped.complete_scenes(), *edits]:
+        settings, _, _ = run.load(name, None, [f"scene.width={WIDTH}"])
         scene = inputs.load_scene(settings.scene)
         envmap, _ = inputs.load_map(settings.input, scene)
         picture = scene.render(envmap, SPP, seed=0)

@@ -58,7 +58,7 @@ def test_of_many_maps_the_last_are_offered(tmp_path):
 
 
 def test_all_that_is_shipped_has_a_picture():
-    names = [f"scene-{name}" for name in shipped.scenes()]
+    names = [f"scene-{name}" for name in shipped.complete_scenes()]
     names += [name.replace("edits/", "edit-") for name in shipped.configurations() if "edits/" in name]
     for name in [*names, "map-sunsky"]:
         height, width, _ = np.array(mi.Bitmap(str(PAGE / f"{name}.jpg"))).shape

@@ -316,7 +316,7 @@ def _start():
     return {
         "type": "start",
         "maps": [os.path.relpath(file) for file in thumbnails.maps([Path.cwd(), Path.cwd() / MAPS])],
-        "scenes": list(shipped.scenes()),
+        "scenes": list(shipped.complete_scenes()),
         "configurations": [name for name in shipped.configurations() if name.startswith("edits/")],
         "recent": project.recent(),
     }

@@ -282,6 +282,10 @@ def test_lights_are_placed_by_clicks_and_shaped(browser, tmp_path):
         page.page.mouse.click(*page.at("#overlay", 0.25, 0.85))
         sync_api.expect(message).to_contain_text("Light 1 casts a shadow here")
         until(lambda: any(one.get("light") == 1 for one in lights()))
+        # ---- Whose light a place has
+        page.page.keyboard.press("w")
+        page.page.mouse.click(*page.at("#overlay", 0.3, 0.8))
+        sync_api.expect(message).to_contain_text(re.compile("Light of this place: .*rest of the map"))
         page.settled(False)
         page.shot("placed")
 

@@ -135,6 +135,9 @@ def test_a_shadow_is_dragged_by_its_tip(painting):
         level = {"rotate_degrees": turn, "tilt_degrees": 3.0}
         session.update(Edit(document(level)))
         before = session.base[:, :, 1].copy()
+        ((sun, share),) = picked(45, 45, of="shares")["shares"]
+        ((_, shaded),) = picked(*tip, of="shares")["shares"]
+        assert sun == 0 and 0.3 < share < 1 and shaded < 0.1, "whose light it is"
         found = picked(*tip)
         assert found["light"] == 0 and len(found["point"]) == 3
         to = picked(*there, light=0, point=tuple(found["point"]))

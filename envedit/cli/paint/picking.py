@@ -128,7 +128,7 @@ class Picking:
                 return found | {"text": "the light would stand where [input] rows keeps the map"}
             return found | place(toward, document)
         if asked.of == "highlight":
-            return {"light": self._lit_by(self._seen(view, asked.x, asked.y), document)}
+            return {"light": self._lit_by(self.seen(view, asked.x, asked.y), document)}
         return self._shadowed(asked, view, shown)
 
     def _direction(self, asked, view, shown):
@@ -159,7 +159,7 @@ class Picking:
                 text = f"light {i + 1}: {reason}" if text == "the map has no light" else text
         return {"light": -1, "text": text}
 
-    def _seen(self, view, x, y):
+    def seen(self, view: int, x: float, y: float) -> np.ndarray:
         """Return how much light each texel gives to the pixels around a place, (H, W): rows of T."""
         patch = np.zeros((self.scene.height, self.scene.width, 3), np.float32)
         seen = patch[self.scene.rows[view]]

@@ -43,6 +43,7 @@ from envedit.losses.perceptual import installed
 from envedit.report import output_folder, run_folder
 from envedit.representations.layers import below_horizon
 from envedit.representations.layers.layers import Layers
+from envedit.representations.layers.lights import DARK
 from envedit.representations.layers.oriented import oriented
 from envedit.representations.layers.placed_lights import PlacedLights, angles
 from envedit.representations.layers.unseen import unseen_kept
@@ -654,11 +655,32 @@ class Session:
         """Say whose highlight or shadow a pixel shows, or where its light must go (:mod:`.picking`)."""
         answer = {"type": "picked", "number": asked.number, "client": asked.client}
         shown = picking.lights(self.placed, self.document)
-        for k in [] if self._dragged else self.problem.shining(self.still):
-            i = picking.index_of(shown, self.problem.layers.lights.centres[k])
+        centres, solved = self.problem.layers.lights.centres, self.run.state
+        own = {k: picking.index_of(shown, centres[k]) for k in self.problem.shining(self.still)}
+        if asked.of == "shares":
+            added = {k: None for k in self.problem.added(solved)}
+            self.tell.say(answer | self._shares(asked, own | added))
+            return
+        for k, i in {} if self._dragged else own.items():
             if i is not None:  # where paint has put it
-                shown[i] = replace(shown[i], direction=self.problem.direction(self.run.state, k))
+                shown[i] = replace(shown[i], direction=self.problem.direction(solved, k))
         self.tell.say(answer | self.picking.answer(asked, self.document, shown))
+
+    def _shares(self, asked, index):
+        """Return whose light a pixel shows: ``shares`` of the map's lights, by their index in the list.
+
+        ``index`` has that of the layers' lights; -1 is for those that paint has added.
+        """
+        seen = self.picking.seen(min(asked.view, len(self.scene.rows) - 1), asked.x, asked.y)
+        whole = float((seen * self.point.edited.mean(axis=2)).sum())
+        shares: dict[int, float] = {}
+        for k, i in index.items() if whole > 0 else ():
+            dark = {name: value.copy() for name, value in self.run.state.items()}
+            dark["flux"][k] = DARK
+            lost = self.point.edited - self.problem.evaluate(dark, resolve=False).edited
+            i = -1 if i is None else i
+            shares[i] = shares.get(i, 0.0) + float((seen * lost.mean(axis=2)).sum()) / whole
+        return {"light": max(shares, key=lambda i: shares[i], default=-1), "shares": list(shares.items())}
 
     # ---- results -------------------------------------------------------------------------------------------
 

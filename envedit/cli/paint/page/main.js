@@ -28,7 +28,7 @@ window.envedit = { log, displays, advise };
 // Tools that ask the server about a place of the rendering. Those with a sentence place a light by a click.
 const PICKS = {
   move: ["highlight"], "move-shadow": ["shadow"], illuminate: ["illuminate", "illuminates this place"],
-  rim: ["rim", "lights the rim from this place on"], cast: ["cast", "casts a shadow here"],
+  rim: ["rim", "lights the rim from this place on"], cast: ["cast", "casts a shadow here"], shares: ["shares"],
 };
 const ORIENTATION = [["degrees", "rotate_degrees"], ["tilt", "tilt_degrees"], ["horizon", "horizon_degrees"]]; // numbers, and their keys
 const AMOUNTS = { light: [2, 0.6], shadow: [1, 0.6], contrast: [4, 1.6] }; // largest, and what is chosen
@@ -338,7 +338,10 @@ function ask(x, y) {
 RECEIVED.picked = (message) => {
   if (message.client !== client) return;
   answered = message.number;
-  if (message.text) say(`Light not moved: ${message.text}`);
+  if (message.shares) {
+    if (message.light >= 0) lights.choose(message.light);
+    say(madeBy(message.shares), true);
+  } else if (message.text) say(`Light not moved: ${message.text}`);
   else if (message.azimuth === undefined) {
     picked = message.light;
     point = message.point ?? [];
@@ -357,6 +360,15 @@ RECEIVED.picked = (message) => {
   clearTimeout(unanswered); // what is dragged meanwhile by its handle is not at its end
   lights.commit();
 };
+
+// Whose light a pixel shows, in words: lights that give 1 % of it or more, and the rest of the map.
+function madeBy(shares) {
+  const listed = lights.list(), percent = (share) => `${Math.round(100 * share)} %`;
+  const named = (i) => i < 0 ? "a light added by paint" : `light ${i + 1}${listed[i]?.entry.name ? ` (${listed[i].entry.name})` : ""}`;
+  const parts = shares.filter(([, share]) => share >= 0.01).sort((a, b) => b[1] - a[1]);
+  const rest = 1 - parts.reduce((sum, [, share]) => sum + share, 0);
+  return `Light of this place: ${[...parts.map(([i, share]) => `${percent(share)} by ${named(i)}`), `${percent(Math.max(0, rest))} by the rest of the map`].join(", ")}`;
+}
 
 const lights = new Lights($("map-stack"), $("handles"), {
   set: $("light"), name: $("light-name"), flux: $("light-flux"), color: $("light-color"), size: $("light-size"),

@@ -153,14 +153,17 @@ class Edit:
     painting: int = 0
 
 
+PICKED = ("highlight", "shadow", "illuminate", "rim", "cast", "shares")
+
+
 @dataclass(frozen=True)
 class Pick:
     """A place on the rendering of a view (shares of width and height) that a light is dragged from, or to.
 
     ``light`` is the index of the light that follows, in the order of the ``lights`` message; -1: the server
     chooses. ``of`` is what is dragged, a "highlight" or a "shadow", and ``point`` what casts the shadow; or
-    what the light is placed to do, to "illuminate", to "rim" or to "cast" a shadow there; or "shares" of light
-    are asked for.
+    what the light is placed to do, to "illuminate", to "rim" or to "cast" a shadow there; or "shares" of
+    light are asked for.
     """
 
     x: float
@@ -224,7 +227,7 @@ def read(text: str | bytes, client: str = "") -> Edit | Pick | Choose | Open | S
             x, y = (Number(0, 1)(found.get(name)) for name in "xy")
             light = int(Number(-1, 100)(found.get("light", -1)))
             view = _count(found.get("view", 0))
-            of = Choice("highlight", "shadow", "illuminate", "rim", "cast", "shares")(found.get("of", "highlight"))
+            of = Choice(*PICKED)(found.get("of", "highlight"))
             number = _count(found.get("number", 0))
             return Pick(x, y, light, number, client, view, of, _point(found.get("point", [])))
         if kind == "open":

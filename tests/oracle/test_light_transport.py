@@ -185,7 +185,7 @@ def test_sky_seen_directly_converges_with_every_seed():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("row, column", [(0, 3), (4, WIDTH - 1), (8, 11)])
+@pytest.mark.parametrize("row, column", [(0, 3), (4, WIDTH - 1)])
 def test_plane_under_one_texel_receives_its_irradiance(row, column):
     # I = albedo / pi * integral of cos(theta) times the texel's tent over the upper hemisphere.
     image = np.zeros((HEIGHT, WIDTH, 3), np.float32)

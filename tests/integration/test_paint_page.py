@@ -122,7 +122,7 @@ def test_paint_drag_undo_save_and_reopen(browser, tmp_path):
         page.page.get_by_test_id("tool-shadow").click()
         page.drag(*(page.at("#overlay", 0.2 + 0.1 * k, 0.82) for k in range(5)))
         page.page.wait_for_function("() => envedit.log.some((e) => e.phase === 'done')")
-        page.settled()
+        page.settled(False)
         page.shot("painted")
         assert page.picture("map") != begun, "the map did not follow the stroke"
         assert 'type = "shadow"' in (folder / "painted.toml").read_text(), "the stroke was not kept"
@@ -130,16 +130,16 @@ def test_paint_drag_undo_save_and_reopen(browser, tmp_path):
         sync_api.expect(page.page.get_by_test_id("unreachable")).to_be_visible()
         page.page.get_by_test_id("undo").click()
         until(lambda: "[[target.strokes]]" not in (folder / "painted.toml").read_text())
-        page.settled()
+        page.settled(False)
         assert page.picture("map") == begun, "undo did not give the map back"
         sync_api.expect(page.page.get_by_test_id("unreachable")).to_be_hidden()
         page.page.get_by_test_id("redo").click()
-        page.settled()
+        page.settled(False)
         x, y = page.at("[data-testid=handle-1]", 0.5, 0.5)
         painted = page.picture("map")
         page.drag((x, y), (x - 30, y + 5), (x - 60, y + 5))
         until(lambda: "[[input.lights]]" in (folder / "painted.toml").read_text())
-        page.settled()
+        page.settled(False)
         assert page.picture("map") != painted, "the map did not follow the light"
         page.page.get_by_test_id("save").click()
         sync_api.expect(page.page.get_by_test_id("message")).to_contain_text("Saved in", timeout=240_000)

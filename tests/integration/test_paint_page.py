@@ -70,10 +70,10 @@ SOLVED = """() => {
 
 
 class Page:
-    """The page and what a user does there."""
+    """The page and what a user does there; ``made`` is one in a window of another kind."""
 
-    def __init__(self, browser, url):
-        self.page = browser.new_page(viewport={"width": 1280, "height": 720})
+    def __init__(self, browser, url, made=None):
+        self.page = made or browser.new_page(viewport={"width": 1280, "height": 720})
         self.page.set_default_timeout(120_000)
         self.faults, self.asked = [], []
         self.page.on("pageerror", lambda error: self.faults.append(str(error)))
@@ -565,3 +565,40 @@ def test_a_photograph_is_compared_with_the_rendering(browser, tmp_path):
         get("reference").select_option("0")
         assert page.picture("render") != photograph
         assert not page.faults, page.faults
+
+
+def test_fingers_paint_and_zoom_on_a_tablet(browser, tmp_path):
+    (tmp_path / "edit.toml").write_text(SMALL)
+    kept = tmp_path / "edit_out" / "painted.toml"
+    with served(tmp_path / "edit.toml") as server:
+        context = browser.new_context(viewport={"width": 820, "height": 1180}, has_touch=True)
+        page = Page(browser, server.url, context.new_page())
+        sync_api.expect(page.page.get_by_test_id("handle-1")).to_be_visible(timeout=120_000)
+        touch = context.new_cdp_session(page.page)
+
+        def fingers(kind, *places):
+            points = [dict(zip("xy", page.at("#overlay", *place), strict=True)) for place in places]
+            touch.send("Input.dispatchTouchEvent", {"type": f"touch{kind}", "touchPoints": points})
+
+        # ---- One paints
+        fingers("Start", (0.2, 0.8))
+        for k in range(6):
+            fingers("Move", (0.2 + 0.08 * k, 0.8))
+        fingers("End")
+        until(lambda: kept.exists() and kept.read_text().count("[[target.strokes]]") == 1)
+        # ---- Two zoom, and paint nothing; nothing is cut off, held upright or level
+        fingers("Start", (0.4, 0.5))
+        fingers("Start", (0.4, 0.5), (0.6, 0.5))
+        for k in range(6):
+            fingers("Move", (0.4 - 0.02 * k, 0.5), (0.6 + 0.02 * k, 0.5))
+        fingers("End")
+        page.page.wait_for_function(
+            "() => document.querySelector('.zoomed').style.transform.includes('scale')"
+        )
+        assert kept.read_text().count("[[target.strokes]]") == 1
+        for width, height in ((820, 1180), (1024, 768)):
+            page.page.set_viewport_size({"width": width, "height": height})
+            assert page.page.evaluate("document.documentElement.scrollWidth") == width
+        page.shot("tablet")
+        assert not page.faults, page.faults
+        context.close()

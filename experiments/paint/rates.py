@@ -3,6 +3,7 @@
 The map is the analytic sky, written at the width of the case; 4k is a file of 4096 x 2048 texels.
 """
 
+import re
 import time
 
 import numpy as np
@@ -51,6 +52,8 @@ def delay_ms(log) -> float:
 def rates(settings, folder, texels) -> dict:
     """Measure one size, with T on disk and kernels compiled."""
     work = prepared(folder)
+    edit = work / "edit.toml"
+    edit.write_text(re.sub("^envmap = .*$", 'envmap = "sky.exr"', edit.read_text(), flags=re.M))
     images.write_exr(work / "sky.exr", analytic_sky.sunsky(texels, azimuth=90.0, elevation=35.0))
     with opened(work):  # T goes to the disk
         pass
@@ -91,7 +94,7 @@ def cases(given):
         calling(
             name,
             f"{__name__}:{rates.__name__}",
-            {"input": {"envmap": "sky.exr"}, "scene": {"file": "sphere", "width": pixels}},
+            {"input": {"envmap": "sunsky"}, "scene": {"file": "sphere", "width": pixels}},
             texels=texels,
         )
         for name, (pixels, texels) in SIZES.items()

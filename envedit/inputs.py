@@ -222,8 +222,14 @@ def _by_hand(settings, input_map):
             numbers = ", ".join(map(str, lacking))
             warnings.append(f"input.lights: got light = {numbers}, but {lights}; the {entries} ignored")
     rotated = oriented(stored, settings.orientation)
-    changed = replace(input_map, stored=rotated, warnings=warnings, placed=placed)
-    return replace(changed, unmoved=input_map.radiance, locked=locked)
+    return replace(
+        input_map,
+        stored=rotated,
+        warnings=warnings,
+        placed=placed,
+        unmoved=input_map.radiance,
+        locked=locked,
+    )
 
 
 def read_file(source: str | np.ndarray, width: int | None, settings: config.Input, scale: float) -> InputMap:

@@ -16,6 +16,7 @@ from tests.oracles.runs import call, changed, differing, pixels, world
 
 pytestmark = pytest.mark.usefixtures("isolated", "own_core")
 
+
 @pytest.fixture
 def carried_out(tmp_path, monkeypatch, threads):
     """Return what runs a configuration on so many threads, its caches empty; it returns the folder."""
@@ -68,9 +69,10 @@ def test_a_wide_pixel_filter_and_odd_numbers_of_samples_give_the_same_files(tmp_
 
 
 @pytest.mark.slow
-def test_another_seed_gives_other_bytes(tmp_path, rng, carried_out):
+@pytest.mark.parametrize("renderer", ["transport", "path"])
+def test_another_seed_gives_other_bytes(renderer, tmp_path, rng, carried_out):
     """So that the same bytes mean something: what is compared depends on the samples."""
-    path = configured(tmp_path, rng, "log-pixels")
+    path = configured(tmp_path, rng, "log-pixels", renderer)
     one, other = carried_out(path, 1), carried_out(path, 1, *changed(seed=1))
     assert "edited.exr" in differing(one, other)
     assert error(one, other) > 1e-4

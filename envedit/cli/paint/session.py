@@ -50,6 +50,7 @@ from envedit.representations.layers.unseen import unseen_kept
 from envedit.scene.scene import Scene
 from envedit.solve import checkpoint, feasibility, gauss_newton, hold, map_problem, prior, search
 from envedit.solve.likelihood import Likelihood
+from envedit.solve.unknowns import with_light
 from envedit.targets import strokes, working_size
 from envedit.targets.pixel_weights import first_hold, pixel_weight
 
@@ -673,13 +674,13 @@ class Session:
         """
         seen = self.picking.seen(min(asked.view, len(self.scene.rows) - 1), asked.x, asked.y)
         whole = float((seen * self.point.edited.mean(axis=2)).sum())
+        rows = self.rows.slice
         shares: dict[int, float] = {}
         for k, i in index.items() if whole > 0 else ():
-            dark = {name: value.copy() for name, value in self.run.state.items()}
-            dark["flux"][k] = DARK
-            lost = self.point.edited - self.problem.evaluate(dark, resolve=False).edited
+            dark = self.problem.params(with_light(self.run.state, k, flux=DARK))
+            lost = (self.point.edited[rows] - self.problem.layers.decode(dark).numpy()).mean(axis=2)
             i = -1 if i is None else i
-            shares[i] = shares.get(i, 0.0) + float((seen * lost.mean(axis=2)).sum()) / whole
+            shares[i] = shares.get(i, 0.0) + float((seen[rows] * lost).sum()) / whole
         return {"light": max(shares, key=lambda i: shares[i], default=-1), "shares": list(shares.items())}
 
     # ---- results -------------------------------------------------------------------------------------------

@@ -17,6 +17,7 @@ from envedit.core.radiance import BRIGHTEST, require_radiance
 from envedit.core.rows import Rows
 from envedit.images import analytic_sky, images, map_regions
 from envedit.representations.layers import unclip
+from envedit.representations.layers.oriented import oriented, oriented_share
 from envedit.representations.layers.placed_lights import PlacedLights, missing
 from envedit.scene import scene as scenes
 from envedit.scene import supported
@@ -58,7 +59,7 @@ class InputMap:
     # The map as the file has it, where lights of it were placed by hand; ``stored`` has them placed
     placed: PlacedLights | None = None
     array: np.ndarray | None = None  # (H, W, 3), the whole map, where it came as an array and not from a file
-    # (H, W, 3), the :attr:`radiance` of the file, where lights were placed or the map was turned by hand
+    # (H, W, 3), the :attr:`radiance` of the file, where lights were placed or the map was rotated by hand
     unmoved: np.ndarray | None = None
     # (H, W, 3), what of :attr:`radiance` is of lights that ``[[input.lights]]`` locks
     locked: np.ndarray | None = None
@@ -205,8 +206,8 @@ def read_map(
 
 
 def _by_hand(settings, input_map):
-    """Return a map as ``lights``, ``regions`` and ``rotate_degrees`` ask, in this order."""
-    if not settings.lights and not settings.regions and not settings.rotate_degrees:
+    """Return a map as ``lights``, ``regions`` and its orientation ask, in this order."""
+    if not settings.lights and not settings.regions and not any(settings.orientation):
         return input_map
     placed = locked = None
     radiance = input_map.radiance
@@ -217,7 +218,7 @@ def _by_hand(settings, input_map):
         lights = placed.locking(settings.lights, kept)
         radiance = placed.place(lights)
         locked = placed.locked(lights, settings.regions)
-        locked = None if locked is None else latlong.rotate(locked, settings.rotate_degrees)
+        locked = None if locked is None else oriented(locked, settings.orientation)
         if lacking := missing(settings.lights, len(placed.lights)):
             count = len(placed.lights)
             known = f"the map has {count} light{'s' if count != 1 else ''}"
@@ -227,12 +228,12 @@ def _by_hand(settings, input_map):
     radiance = map_regions.changed(radiance, settings.regions)
     return replace(
         input_map,
-        stored=latlong.rotate(input_map.as_stored(radiance), settings.rotate_degrees),
+        stored=oriented(input_map.as_stored(radiance), settings.orientation),
         warnings=warnings,
         placed=placed,
         unmoved=input_map.radiance,
         locked=locked,
-        kept=None if kept is None else latlong.rotate(kept, settings.rotate_degrees),
+        kept=None if kept is None else oriented_share(kept, settings.orientation),
     )
 
 

@@ -376,7 +376,7 @@ class _Edit:
                 self.ceiling = self._rendered(target.envmap), target.picture
             elif target.initial is not None:
                 self.ceiling = self.unedited, target.initial
-            by_hand = self.settings.input.rotate_degrees
+            by_hand = self.settings.input.orientation
             self.lights, self.core = light_list.of_edit(
                 self.map, self.edited, self.scene.to_world, by_hand, self.degrees
             )

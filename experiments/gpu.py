@@ -129,14 +129,15 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--variant", default="cuda_ad_rgb", help="Mitsuba variant (%(default)s)")
     parser.add_argument("--minutes", type=float, default=8.0, help="at most (%(default)s)")
     parser.add_argument("--small", action="store_true", help="tiny sizes, to test this program")
+    parser.add_argument("--steps", nargs="+", choices=STEPS, default=STEPS, metavar="STEP", help="these")
     given = parser.parse_args(argv)
     end = time.monotonic() + 60 * given.minutes
-    steps: dict[str, dict[str, Any]] = {step: {} for step in STEPS}
+    steps: dict[str, dict[str, Any]] = {step: {} for step in given.steps}
     found = {"machine": machine(), "minutes": given.minutes, "small": given.small, "steps": steps}
     failed = False
     for variant in dict.fromkeys([given.variant, CPU]):
-        for step in STEPS:
-            if step != "doctor" and "error" in steps["doctor"][variant]:
+        for step in given.steps:
+            if step != "doctor" and "error" in steps.get("doctor", {}).get(variant, {}):
                 continue
             one = steps[step][variant] = measured(step, variant, given.small, end - time.monotonic())
             failed |= "error" in one and variant == given.variant

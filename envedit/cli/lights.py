@@ -31,10 +31,10 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _lights(arguments, console):
-    from envedit.export import file_lights
     from envedit.images import images
     from envedit.maps import map_lights
     from envedit.report import manifest, output_folder
+    from envedit.representations.layers import file_lights
 
     # ---- The lights, in Rec. 709 and in the colours of the file
     input_map = map_command.read(arguments.map, arguments, console)

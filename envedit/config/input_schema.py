@@ -14,6 +14,7 @@ from envedit.core import extensions
 from envedit.core.color import TONEMAPS
 from envedit.core.errors import ConfigError
 from envedit.core.primaries import SPACES
+from envedit.core.rotations import Orientation
 from envedit.core.tone_curves import TONE_CURVES
 
 TURN_DEGREES = 60.0
@@ -62,8 +63,17 @@ class Input(Table):
         "turn of the map about the vertical before the edit, as target.rotate_degrees",
         "degrees",
     )
+    tilt_degrees: float = key(
+        0.0,
+        Number(-180, 180),
+        "rotate the map clockwise about its middle, with rotate_degrees and horizon_degrees as one rotation",
+        "degrees",
+    )
+    horizon_degrees: float = key(
+        0.0, Number(-90, 90), "likewise: raise the middle of the map, and lower its back", "degrees"
+    )
     lights: tuple[dict, ...] = key(
-        (), LightList(), "lights moved, changed or added by hand, before turn and edit"
+        (), LightList(), "lights moved, changed or added by hand, before the map is rotated and edited"
     )
     regions: tuple[dict, ...] = key(
         (), RegionList(), "regions of the map that are kept, scaled or filled, after lights and before turn"
@@ -83,6 +93,11 @@ class Input(Table):
         Boolean(),
         "replace NaN by its neighbours and +Inf by the brightest light, and do not refuse the map",
     )
+
+    @property
+    def orientation(self) -> Orientation:
+        """How the map is rotated before the edit."""
+        return Orientation(self.rotate_degrees, self.tilt_degrees, self.horizon_degrees)
 
     def _check_together(self) -> None:
         if not self.envmap:

@@ -29,7 +29,13 @@ MOST_PLACED = 64
 _BRIGHTEST = 1e6
 _FLUX = Numbers(*3 * [Number(0, _BRIGHTEST)])
 _PLACE: dict[str, Check] = {"azimuth": Number(-360, 720), "elevation": Number(-90, 90)}
-_LISTED: dict[str, Check] = {"name": String(), "muted": Boolean(), "locked": Boolean()}
+ROLES = ("key", "fill", "rim")
+_LISTED: dict[str, Check] = {
+    "name": String(),
+    "role": Choice(*ROLES),
+    "muted": Boolean(),
+    "locked": Boolean(),
+}
 OWN: dict[str, Check] = {
     "light": Integer(1, 8),
     **_PLACE,
@@ -64,6 +70,7 @@ MEANINGS = {
     "rotation": "likewise: degrees by which its longer side is turned to the left from the horizontal",
     "softness": "likewise, but not of a Gaussian: 0 has a sharp border, 1 fades from the middle",
     "name": "what it is called in the page of `envedit paint`",
+    "role": "what it does in the picture, a label like the name",
     "muted": "whether it is switched off",
     "locked": "whether an edit of layers leaves it, with its glow, as it is here",
 }

@@ -1,8 +1,9 @@
-"""Rotations of directions, as rotation vectors: the axis times the angle in radians."""
+"""Rotations of directions, as rotation vectors (the axis times the angle in radians), and of a whole map."""
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -51,6 +52,32 @@ def rotation_between(start: np.ndarray, end: np.ndarray) -> np.ndarray:
     axis = np.cross(start, end)
     sine = float(np.linalg.norm(axis))
     return axis * (np.arctan2(sine, start @ end) / max(sine, 1e-30))
+
+
+class Orientation(NamedTuple):
+    """How a map is rotated as a whole, in degrees.
+
+    In the map's frame (+y up, the middle column towards +z): first ``horizon`` raises the middle of the map,
+    then ``tilt`` rotates clockwise about it, both as seen in the map as it is, then ``turn`` about the
+    vertical moves the picture to the left (:func:`.latlong.rotate`).
+    """
+
+    turn: float = 0.0
+    tilt: float = 0.0
+    horizon: float = 0.0
+
+    @property
+    def level(self) -> bool:
+        """Whether it is a turn about the vertical alone, or nothing."""
+        return not self.tilt and not self.horizon
+
+    @property
+    def matrix(self) -> np.ndarray:
+        """Matrix (3, 3) that takes directions of the map to those of the rotated map."""
+        matrix = np.eye(3)
+        for vector in ((-self.horizon, 0.0, 0.0), (0.0, 0.0, self.tilt), (0.0, self.turn, 0.0)):
+            matrix = rotation_matrix(np.radians(vector)) @ matrix
+        return matrix
 
 
 def rotation_matrix(turn: np.ndarray) -> np.ndarray:

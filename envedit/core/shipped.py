@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import envedit
@@ -22,6 +23,17 @@ def scenes() -> tuple[str, ...]:
     """Name the shipped scenes: what ``[scene] file`` takes without a path."""
     root = folder()
     return tuple(sorted(path.stem for path in root.glob("*.xml"))) if root else ()
+
+
+def complete_scenes() -> tuple[str, ...]:
+    """Name the shipped scenes that need no parameter to be given."""
+    root = folder()
+    texts = {name: (root / f"{name}.xml").read_text(encoding="utf-8") for name in scenes()} if root else {}
+    return tuple(
+        name
+        for name, text in texts.items()
+        if set(re.findall(r"\$(\w+)", text)) <= set(re.findall(r'<default name="(\w+)"', text))
+    )
 
 
 def configurations() -> tuple[str, ...]:

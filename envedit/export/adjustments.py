@@ -14,7 +14,7 @@ from envedit import config
 from envedit.core import latlong
 from envedit.core.color import luminance
 from envedit.core.errors import NumericalError
-from envedit.export import file_lights
+from envedit.representations.layers import file_lights
 from envedit.representations.layers.separation import Light
 from envedit.targets.strokes import gains
 

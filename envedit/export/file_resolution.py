@@ -14,6 +14,7 @@ from envedit.export import adjustments, full_resolution
 from envedit.images import map_regions
 from envedit.representations import Layers, Representation
 from envedit.representations.layers import placed_lights
+from envedit.representations.layers.oriented import oriented, oriented_share
 
 if TYPE_CHECKING:
     from envedit import results
@@ -91,7 +92,7 @@ def carried(
     edited = edited if locked is None else edited + locked
     edited = edited if solution.level == 1 else edited * np.float32(solution.level)
     if kept is not None:
-        kept = latlong.rotate(kept, settings.rotate_degrees + solution.turn_degrees)
+        kept = latlong.rotate(oriented_share(kept, settings.orientation), solution.turn_degrees)
         edited = map_regions.blended(edited, original, kept)
     return full, edited
 
@@ -106,7 +107,7 @@ def _kept_lights_locked(settings, input_map):
 
 
 def _by_hand(settings: config.Input, input_map: inputs.InputMap, own: inputs.InputMap) -> inputs.InputMap:
-    """Place the lights of the map as the file has it, change its regions, and turn it, as at working size."""
+    """Place lights, change regions, and rotate the map as the file has it, as at working size."""
     full = own
     if input_map.placed is not None:
         placed = input_map.placed
@@ -122,4 +123,4 @@ def _by_hand(settings: config.Input, input_map: inputs.InputMap, own: inputs.Inp
     if settings.regions:
         changed = map_regions.changed(full.radiance, settings.regions)
         full = replace(full, stored=full.as_stored(changed))
-    return replace(full, stored=latlong.rotate(full.stored, settings.rotate_degrees))
+    return replace(full, stored=oriented(full.stored, settings.orientation))

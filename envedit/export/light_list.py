@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from envedit.core import latlong
+from envedit.core.rotations import Orientation
 from envedit.inputs import InputMap
 from envedit.representations.layers.placed_lights import direction
 from envedit.representations.layers.separation import Light, Separation, separate
@@ -44,20 +45,23 @@ def split(envmap: np.ndarray, core: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 
 def of_edit(
-    input_map: InputMap, edited: np.ndarray, to_world: np.ndarray, by_hand: float, degrees: float = 0.0
+    input_map: InputMap, edited: np.ndarray, to_world: np.ndarray, by_hand: Orientation, degrees: float = 0.0
 ) -> tuple[dict[str, list[dict]], np.ndarray]:
     """Match the lights of a map as its file has it and as edited.
 
     ``edited`` (H, W, 3) is linear radiance that reaches the scene, ``to_world`` as of :func:`listed`;
-    ``by_hand`` and ``degrees`` are by how much the map was turned when it was read, and by the edit. Returns
-    what :func:`matched` does, and the lights of the edited map alone, (H, W, 3) float32.
+    ``by_hand`` is how the map was rotated when it was read, ``degrees`` by how much the edit turned it.
+    Returns what :func:`matched` does, and the lights of the edited map alone, (H, W, 3) float32.
     """
     first = last = separate(input_map.radiance if input_map.unmoved is None else input_map.unmoved)
     if input_map.unmoved is not None:
-        last = kept(first, separate(input_map.radiance), input_map.unmoved, input_map.radiance, by_hand)
+        last = separate(input_map.radiance)
+        if by_hand.level:  # other rotations resample every texel
+            last = kept(first, last, input_map.unmoved, input_map.radiance, by_hand.turn)
     last = kept(last, separate(edited), input_map.radiance, edited, degrees)
     before, after = (listed(separation.lights, edited.shape[:2], to_world) for separation in (first, last))
-    return matched(before, after, by_hand + degrees), np.minimum(last.core, edited).astype(np.float32)
+    rotation = Orientation(degrees).matrix @ by_hand.matrix
+    return matched(before, after, rotation), np.minimum(last.core, edited).astype(np.float32)
 
 
 def listed(separated: list[Light], shape: tuple[int, int], to_world: np.ndarray) -> list[dict]:
@@ -134,6 +138,7 @@ def kept(
     Returns ``after`` with other lights, and the core of these.
     """
     same = np.asarray((latlong.rotate(start, degrees) == end).all(axis=2)).ravel()
+    rotation = Orientation(degrees).matrix
     lights = []
     others = list(after.lights)
     touched = np.zeros(len(same), bool)
@@ -145,7 +150,7 @@ def kept(
         touched |= occupied
         overlapping = [other for other in others if occupied[other.texels].any()]
         if same[occupied].all() and all(same[other.texels].all() for other in overlapping):
-            toward = _turned(light.direction, degrees)
+            toward = rotation @ light.direction
             texels = np.flatnonzero(occupied)
             lights.append(replace(light, direction=toward, texels=texels, radiance=core[occupied]))
             others = [other for other in others if not occupied[other.texels].any()]
@@ -156,7 +161,9 @@ def kept(
     return replace(after, core=core, lights=lights)
 
 
-def matched(before: list[dict], after: list[dict], degrees: float = 0.0) -> dict[str, list[dict]]:
+def matched(
+    before: list[dict], after: list[dict], rotation: np.ndarray | None = None
+) -> dict[str, list[dict]]:
     """Find which light of a map has become which light of the edited map.
 
     Of all ways to pair them, the one with the least sum of angle + abs(ln(flux ratio)) (radians; fluxes are
@@ -167,16 +174,15 @@ def matched(before: list[dict], after: list[dict], degrees: float = 0.0) -> dict
     ----------
     before, after : list of dict
         Of :func:`listed`.
-    degrees : float
-        By how much the whole map was turned (:func:`.latlong.rotate`): angles are to where that brings a
-        light.
+    rotation : ndarray (3, 3), optional
+        Of the whole map between them: angles are to where that brings a light.
 
     Returns
     -------
     dict
         The lists ``before`` and ``after``. A light has the same ``id`` in both, from 1; ``before`` has
         ``removed``, whether it is gone, and ``after`` has ``added``, whether it is new, and ``moved_degrees``
-        from where it was before any turn, None if it is new.
+        from where it was before any rotation, None if it is new.
     """
     # ---- Pair lights that are near to each other and of similar flux
     start, end = (
@@ -184,7 +190,8 @@ def matched(before: list[dict], after: list[dict], degrees: float = 0.0) -> dict
         for lights in (before, after)
     )
     flux = [np.log([max(np.mean(light["flux"]), 1e-30) for light in lights]) for lights in (before, after)]
-    apart = np.arccos(np.clip(_turned(start, degrees) @ end.T, -1, 1))
+    there = start if rotation is None else start @ rotation.T
+    apart = np.arccos(np.clip(there @ end.T, -1, 1))
     partner = _paired(apart + np.abs(flux[0][:, None] - flux[1]))
     moved = np.degrees(np.arccos(np.clip(start @ end.T, -1, 1)))
 
@@ -235,12 +242,6 @@ def _named(light):
 
 def _place(light):
     return f"azimuth {round(light['azimuth']) % 360}, elevation {round(light['elevation'])}"
-
-
-def _turned(directions, degrees):
-    """Turn directions (..., 3) as :func:`.latlong.rotate` turns a map."""
-    c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
-    return directions @ np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]])
 
 
 def _paired(cost):

@@ -7,10 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from envedit import config
-from envedit.core import latlong
 from envedit.core.color import luminance
+from envedit.core.rotations import Orientation
 from envedit.export import adjustments
 from envedit.maps import sphere
+from envedit.representations.layers.oriented import oriented
 
 _ROWS = 256  # of a map that are worked on at a time
 
@@ -19,7 +20,7 @@ _ROWS = 256  # of a map that are worked on at a time
 class Adjustments:
     """What is changed of a map; the defaults change nothing."""
 
-    # turn, tilt, horizon: degrees, as of :func:`.sphere.rotation`
+    # turn, tilt, horizon: degrees, as of :class:`.Orientation`
     turn: float = 0.0
     tilt: float = 0.0
     horizon: float = 0.0
@@ -38,11 +39,11 @@ def adjusted(radiance: np.ndarray, how: Adjustments) -> tuple[np.ndarray, list[s
     """
     # ---- Orientation
     notes = []
-    if how.tilt or how.horizon:
-        radiance = sphere.rotate(radiance, sphere.rotation(how.turn, how.tilt, how.horizon))
+    orientation = Orientation(how.turn, how.tilt, how.horizon)
+    radiance = oriented(radiance, orientation)
+    if not orientation.level:
         notes.append(f"turned by {how.turn:g}, tilted by {how.tilt:g}, raised by {how.horizon:g} degrees")
     elif how.turn:
-        radiance = latlong.rotate(radiance, how.turn)
         notes.append(f"turned by {how.turn:g} degrees")
 
     # ---- Exposure, white balance and saturation

@@ -13,8 +13,8 @@ import numpy as np
 
 from envedit.core import latlong
 from envedit.core.rotations import rotated, rotation_between, rotation_matrix, rotation_vector
-from envedit.export import file_lights, light_list
-from envedit.maps import sphere
+from envedit.export import light_list
+from envedit.representations.layers import file_lights, oriented
 from envedit.representations.layers.separation import GLOW_DEGREES, Light, glow_at
 
 BLACK = 1e-4
@@ -81,7 +81,7 @@ def blend(first: np.ndarray, second: np.ndarray, amount: float) -> tuple[np.ndar
     for move in moves:
         for light, flux in move.parts:
             matrix = rotation_matrix(rotation_vector(light.direction, move.direction))
-            sphere.add_rotated(first, light, matrix, flux)
+            oriented.add_rotated(first, light, matrix, flux)
     return first, [
         {
             "direction": move.direction.tolist(),

@@ -7,10 +7,11 @@ import numpy as np
 from envedit import config
 from envedit.core import latlong
 from envedit.core.color import luminance
-from envedit.export import file_lights, light_list
+from envedit.export import light_list
 from envedit.losses import metrics
 from envedit.losses.perceptual import distances, installed
 from envedit.maps import map_lights
+from envedit.representations.layers import file_lights
 
 METRIC_WIDTH = 2048
 """Most columns of the copies that pictures and irradiance are compared on: in double precision SSIM of 8192

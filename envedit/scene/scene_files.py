@@ -39,11 +39,13 @@ IMAGE_MEMORY = 2**34
 """For an image, whose size is bounded by what its header may declare."""
 _WAIT = 4  # times the processor time, on the clock
 _REMEMBERED_BYTES = 2**20  # of entries in the folder of caches: some 5,000 files
-_CODE = """
+CODE = """
 import importlib, json, sys
 sys.path[:], module, arguments = json.load(sys.stdin)
 importlib.import_module(module).main(*arguments)
 """
+"""Runs ``main`` of a module in a process of its own, which reads ``sys.path``, the module's name and
+arguments from standard input, as JSON."""
 _HINTS = {"ply": ", as triangles", "spectrum": ", as NAME.spd"}  # what Mitsuba reads of these
 _remembered: set[str] = set()
 
@@ -122,7 +124,7 @@ def lines_of(
     """
     try:
         output = subprocess.run(
-            [sys.executable, "-P", "-c", _CODE],
+            [sys.executable, "-P", "-c", CODE],
             input=json.dumps([[os.fspath(folder) for folder in sys.path], module, arguments]).encode(),
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,

@@ -28,7 +28,7 @@ from envedit.solve import gauss_newton, painted_places
 from envedit.solve.light_places import Places
 from envedit.solve.likelihood import INDEPENDENT
 from envedit.solve.map_problem import LARGEST_STEP, SIGMA, Problem
-from envedit.solve.unknowns import Point
+from envedit.solve.unknowns import Point, with_light
 
 MOVED, SOFTENED, REMOVED, ADDED = "moved", "softened", "removed", "light added"
 POSITIVE_EVIDENCE = 2.0
@@ -235,7 +235,7 @@ def _beside_the_sky(problem, best, sigma):
     lights, state, start = problem.layers.lights, best.run.state, best.run.start
     problem.evaluate(state)  # what was tried since may have taken its columns of T
     for k in problem.shining(state):
-        own, dark = k < lights.own, _changed(state, k, flux=DARK)
+        own, dark = k < lights.own, with_light(state, k, flux=DARK)
         places = _places(problem, dark, start, sigma)
         if places is None:
             continue
@@ -252,7 +252,7 @@ def _beside_the_sky(problem, best, sigma):
                 continue
             turn = rotation_vector(lights.centres[k], there.direction)
             flux = start["flux"][k] if own else np.log(there.factor)
-            moved, centre = (_changed(one, k, turn=turn, flux=flux) for one in (state, start))
+            moved, centre = (with_light(one, k, turn=turn, flux=flux) for one in (state, start))
             yield _Move(k, MOVED, moved, centre, gain=there.fall - stays)
 
     # ---- one more
@@ -261,7 +261,7 @@ def _beside_the_sky(problem, best, sigma):
         places = _places(problem, state, start, sigma)
         for there in places.best(k) if places else []:
             turn, flux = rotation_vector(lights.centres[k], there.direction), np.log(there.factor)
-            more, centre = (_changed(one, k, turn=turn, flux=flux, size=0.0) for one in (state, start))
+            more, centre = (with_light(one, k, turn=turn, flux=flux, size=0.0) for one in (state, start))
             yield _Move(k, ADDED, more, centre, gain=there.fall - ADDED_LIGHT_COST)
 
 
@@ -296,21 +296,21 @@ def _changes(problem, state, start, sigma):
 
     for k in problem.shining(state):
         own = k < lights.own
-        dark = _changed(state, k, flux=DARK)
+        dark = with_light(state, k, flux=DARK)
         # ---- elsewhere
         away = problem.direction(state, k)
         for direction, flux, unlikeliness in painted_places.best(problem, dark, k, sigma, away):
             turn = rotation_vector(lights.centres[k], direction)
-            moved = _changed(state, k, turn=turn, flux=flux)
-            centre = _changed(start, k, turn=turn) if own else _changed(start, k, turn=turn, flux=flux)
+            moved = with_light(state, k, turn=turn, flux=flux)
+            centre = with_light(start, k, turn=turn) if own else with_light(start, k, turn=turn, flux=flux)
             yield k, MOVED, moved, centre, unlikeliness, 0.0
         # ---- softer: a light of few texels cannot grow, as its texels would part; a lobe can
         if own and spare:
             flux = state["flux"][k] + np.log(lights.flux[k] / np.maximum(lights.flux[spare[0]], 1e-30))
             turn = rotation_vector(lights.centres[spare[0]], away)
             size = lights.log_size(SOFT_DEGREES)
-            soft = _changed(dark, spare[0], turn=turn, flux=flux, size=size)
-            centre = _changed(start, spare[0], turn=turn, flux=flux, size=size)
+            soft = with_light(dark, spare[0], turn=turn, flux=flux, size=size)
+            centre = with_light(start, spare[0], turn=turn, flux=flux, size=size)
             yield k, SOFTENED, soft, centre, _unlikeliness(problem, soft, sigma), 0.0
         # ---- out, if it was added
         if not own:
@@ -321,17 +321,9 @@ def _changes(problem, state, start, sigma):
     for k in spare[:1]:
         for direction, flux, unlikeliness in painted_places.best(problem, state, k, sigma):
             turn = rotation_vector(lights.centres[k], direction)
-            more = _changed(state, k, turn=turn, flux=flux, size=size)
-            centre = _changed(start, k, turn=turn, flux=flux, size=size)
+            more = with_light(state, k, turn=turn, flux=flux, size=size)
+            centre = with_light(start, k, turn=turn, flux=flux, size=size)
             yield k, ADDED, more, centre, unlikeliness, ADDED_LIGHT_COST
-
-
-def _changed(state, k, **values):
-    """Return a state with other values of one light."""
-    state = {name: value.copy() for name, value in state.items()}
-    for name, value in values.items():
-        state[name][k] = value
-    return state
 
 
 def _unlikeliness(problem, state, sigma):

@@ -152,6 +152,14 @@ class Unknowns:
         return rotated(self.layers.lights.centres[i], state["turn"][i])
 
 
+def with_light(state: dict, k: int, **values: Any) -> dict:
+    """Return a state with other values of one light, by the names of its unknowns."""
+    state = {name: value.copy() for name, value in state.items()}
+    for name, value in values.items():
+        state[name][k] = value
+    return state
+
+
 def in_numpy(unit: Any) -> Any:
     """Return a unit of :attr:`.Layers.scales`, a number or a tensor, as numpy has it."""
     return unit.numpy() if hasattr(unit, "numpy") else np.float64(unit)

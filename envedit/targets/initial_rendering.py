@@ -27,7 +27,8 @@ NEIGHBOUR = ".envedit.json"
 """Ending of the file beside an exported picture that says what the picture's own metadata says."""
 KEYS = {
     "width": "scene.width", "height": "scene.height", "map_width": "input.width", "spp": "target.spp",
-    "seed": "seed",
+    "seed": "seed", "turn": "input.rotate_degrees", "tilt": "input.tilt_degrees",
+    "horizon": "input.horizon_degrees",
 }  # fmt: skip
 """What must be the same where a picture is exported and where it is read, and the key that sets it."""
 _MOST_BYTES = 1 << 16  # of a neighbour that is read
@@ -133,6 +134,7 @@ def origin(settings: config.Config, shape: Shape, name: str) -> Info:
         "map_width": settings.input.width,
         "spp": settings.target.spp,
         "seed": settings.seed,
+        **{name: float(value) for name, value in settings.input.orientation._asdict().items()},
     }
 
 

@@ -22,7 +22,7 @@ from envedit.config import presets
 from experiments.harness import Case, Experiment, calling, number
 
 FACTORS = {"halved": 0.5, "doubled": 2.0}
-NO_SCALE = {"light_places.APART", "prior.DEGREES", "layers_solver.CHECKED_SPP", "normal_equations.ROWS"}
+NO_SCALE = {"light_places.PLACES_APART_COSINE", "prior.DEGREES", "normal_equations.ROWS"}
 """A cosine, the length of a series, and what decides only how long something takes."""
 SHADOW = {"type": "shadow", "ellipse": [0.75, 0.75, 0.2, 0.1], "softness": 0.03, "amount": 0.8}
 EDITS: dict[str, dict] = {

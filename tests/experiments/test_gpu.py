@@ -68,8 +68,10 @@ def test_a_step_ends_with_all_that_it_has_started_when_the_time_is_over(tmp_path
 
 
 @pytest.mark.slow
-def test_the_script_measures_all_steps_at_tiny_sizes(tmp_path):
-    command = ["bash", ROOT / "experiments/gpu.sh", tmp_path / "gpu.json", "--small"]
+def test_the_script_measures_at_tiny_sizes(tmp_path):
+    """Other tests run what *doctor* and *engine* do, and *quickstart* is as *solver*."""
+    script = ROOT / "experiments/gpu.sh"
+    command = ["bash", script, tmp_path / "gpu.json", "--small", "--steps", "solver", "fit"]
     own = {"PYTHON": sys.executable, "XDG_CACHE_HOME": str(tmp_path / "cache")}
     done = subprocess.run(
         [*command, "--variant", "llvm_ad_rgb"],
@@ -83,5 +85,4 @@ def test_the_script_measures_all_steps_at_tiny_sizes(tmp_path):
     found = {step: one["llvm_ad_rgb"] for step, one in steps.items()}
     assert all(one["wall_s"] > 0 for one in found.values()), found
     assert found["solver"]["psnr"]["render"] > found["solver"]["psnr"]["initial"]
-    assert found["engine"]["transport"][0]["adjointness"] < 1e-5 and found["engine"]["siren"]
     assert found["fit"]["epochs"] == 6

@@ -174,6 +174,7 @@ COUNTS = {
     "natural.skies": 1,
     "paint.artists": 12,
     "paint.figure10": 7,
+    "paint.rates": 3,
     "paint.soak": 1,
     "painted_edits": 18,
     "painted_edits.artists": 296,

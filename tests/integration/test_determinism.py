@@ -16,8 +16,6 @@ from tests.oracles.runs import call, changed, differing, pixels, world
 
 pytestmark = pytest.mark.usefixtures("isolated", "own_core")
 
-KINDS = ("layers", "siren", "log-pixels")
-
 
 @pytest.fixture
 def carried_out(tmp_path, monkeypatch, threads):
@@ -47,7 +45,7 @@ def configured(folder, rng, kind, renderer="transport"):
     return world(folder, rng, **tables)
 
 
-CASES = [("transport", kind) for kind in KINDS] + [("path", "siren")]
+CASES = [("transport", "layers"), ("transport", "siren"), ("path", "siren")]
 
 
 @pytest.mark.slow

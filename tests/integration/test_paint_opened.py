@@ -52,7 +52,7 @@ def test_save_goes_on_from_what_is_shown_and_tells_what_differs(tmp_path):
     erased = {"type": "erase-shadow", "ellipse": [0.62, 0.3, 0.12, 0.12], "softness": 0.05}
     with served(tmp_path / "edit.toml") as server, connected(server) as page:
         heard(page, "opened")
-        painted = {"strokes": [erased], "rest": "follow"}
+        painted = {"strokes": [erased], "rest": "follow", "tilt_degrees": 4, "horizon_degrees": -3}
         page.send(json.dumps({"type": "document", "number": 1, "document": painted}))
         heard(page, "status", lambda m: m.get("number") == 1 and m["iterations"] > 1)
         page.send(json.dumps({"type": "save"}))

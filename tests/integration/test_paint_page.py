@@ -10,8 +10,10 @@ import pytest
 
 from envedit import config, pipeline
 from envedit.core.color import luminance
+from envedit.core.rotations import Orientation
 from envedit.core.tone_curves import TONE_CURVES
-from envedit.images import images
+from envedit.images import analytic_sky, images
+from envedit.representations.layers.placed_lights import angles, direction
 from envedit.targets.strokes import gains
 from tests.oracles.builders import LIGHT, write_scene
 from tests.oracles.painting import OF_TWO, SMALL, TWO_VIEWS, photographed, served, until
@@ -68,10 +70,10 @@ SOLVED = """() => {
 
 
 class Page:
-    """The page and what a user does there."""
+    """The page and what a user does there; ``made`` is one in a window of another kind."""
 
-    def __init__(self, browser, url):
-        self.page = browser.new_page(viewport={"width": 1280, "height": 720})
+    def __init__(self, browser, url, made=None):
+        self.page = made or browser.new_page(viewport={"width": 1280, "height": 720})
         self.page.set_default_timeout(120_000)
         self.faults, self.asked = [], []
         self.page.on("pageerror", lambda error: self.faults.append(str(error)))
@@ -120,7 +122,7 @@ def test_paint_drag_undo_save_and_reopen(browser, tmp_path):
         page.page.get_by_test_id("tool-shadow").click()
         page.drag(*(page.at("#overlay", 0.2 + 0.1 * k, 0.82) for k in range(5)))
         page.page.wait_for_function("() => envedit.log.some((e) => e.phase === 'done')")
-        page.settled()
+        page.settled(False)
         page.shot("painted")
         assert page.picture("map") != begun, "the map did not follow the stroke"
         assert 'type = "shadow"' in (folder / "painted.toml").read_text(), "the stroke was not kept"
@@ -128,16 +130,16 @@ def test_paint_drag_undo_save_and_reopen(browser, tmp_path):
         sync_api.expect(page.page.get_by_test_id("unreachable")).to_be_visible()
         page.page.get_by_test_id("undo").click()
         until(lambda: "[[target.strokes]]" not in (folder / "painted.toml").read_text())
-        page.settled()
+        page.settled(False)
         assert page.picture("map") == begun, "undo did not give the map back"
         sync_api.expect(page.page.get_by_test_id("unreachable")).to_be_hidden()
         page.page.get_by_test_id("redo").click()
-        page.settled()
+        page.settled(False)
         x, y = page.at("[data-testid=handle-1]", 0.5, 0.5)
         painted = page.picture("map")
         page.drag((x, y), (x - 30, y + 5), (x - 60, y + 5))
         until(lambda: "[[input.lights]]" in (folder / "painted.toml").read_text())
-        page.settled()
+        page.settled(False)
         assert page.picture("map") != painted, "the map did not follow the light"
         page.page.get_by_test_id("save").click()
         sync_api.expect(page.page.get_by_test_id("message")).to_contain_text("Saved in", timeout=240_000)
@@ -280,6 +282,10 @@ def test_lights_are_placed_by_clicks_and_shaped(browser, tmp_path):
         page.page.mouse.click(*page.at("#overlay", 0.25, 0.85))
         sync_api.expect(message).to_contain_text("Light 1 casts a shadow here")
         until(lambda: any(one.get("light") == 1 for one in lights()))
+        # ---- Whose light a place has
+        page.page.keyboard.press("w")
+        page.page.mouse.click(*page.at("#overlay", 0.3, 0.8))
+        sync_api.expect(message).to_contain_text(re.compile("Light of this place: .*rest of the map"))
         page.settled(False)
         page.shot("placed")
 
@@ -411,6 +417,93 @@ def test_lights_listed_states_compared_the_map_large_and_zoom(browser, tmp_path)
         assert not page.faults, page.faults
 
 
+def map_is_levelled(page, kept, session):
+    """The horizon by the line's grips, keys and numbers: the handle of a light goes along."""
+    get = page.page.get_by_test_id
+
+    def orientation():
+        return tuple(config.load(kept).input.orientation) if kept.exists() else None
+
+    page.page.keyboard.press("l")
+    grip = get("grip-tilt").bounding_box()
+    x, y = grip["x"] + grip["width"] / 2, grip["y"] + grip["height"] / 2
+    height = page.page.locator("#map-stack").bounding_box()["height"]
+    page.drag((x, y), (x, y - height / 10))
+    until(lambda: orientation() == (0, pytest.approx(-18, abs=0.5), 0))
+    get("grip-horizon").press("Shift+ArrowUp")
+    get("tilt").fill("12")
+    get("tilt").press("Enter")
+    get("degrees").fill("100")
+    get("degrees").press("Enter")
+    until(lambda: orientation() == (100, 12, 5))
+    toward = Orientation(100, 12, 5).matrix @ session.placed.lights[0].direction
+    azimuth, elevation = angles(toward)
+    box, at = (page.page.locator(name).bounding_box() for name in ("#map-stack", "[data-testid=handle-1]"))
+    seen = at["x"] + at["width"] / 2 - box["x"], at["y"] + at["height"] / 2 - box["y"]
+    expected = azimuth / 360 * box["width"], (90 - elevation) / 180 * box["height"]
+    assert seen == pytest.approx(expected, abs=1)
+    # ---- A key moves a light on the map as it is seen
+    get("handle-1").press("ArrowRight")
+    until(lambda: config.load(kept).input.lights)
+    (light,) = config.load(kept).input.lights
+    moved = angles(Orientation(100, 12, 5).matrix @ direction(light["azimuth"], light["elevation"]))
+    assert moved == pytest.approx((azimuth + 1, elevation), abs=0.05)
+    page.shot("level")
+    assert not page.page.evaluate(UNNAMED)
+    assert not page.page.evaluate(FAINT)
+    get("undo").click()
+    get("undo").click()
+    until(lambda: orientation() == (0, 12, 5))
+
+
+def lights_are_ordered(page, kept):
+    """Roles, and the order of the list by buttons and keys."""
+    get = page.page.get_by_test_id
+
+    def lights():
+        return [(one.get("light"), one.get("role")) for one in config.load(kept).input.lights]
+
+    get("add-light").click()
+    get("list-role-2").select_option("rim")
+    until(lambda: lights() == [(None, "rim")])
+    get("list-up-2").click()
+    until(lambda: lights() == [(None, "rim"), (1, None)])
+    sync_api.expect(get("list-name-1")).to_have_attribute("placeholder", "added")
+    sync_api.expect(get("handle-1")).to_have_attribute("aria-pressed", "true")
+    sync_api.expect(get("list-choose-1")).to_be_focused()  # its button, as it cannot go up further
+    get("list-role-2").select_option("key")
+    get("list-choose-2").press("Alt+ArrowUp")
+    until(lambda: lights() == [(1, "key"), (None, "rim")])
+    sync_api.expect(get("list-choose-1")).to_be_focused()
+
+
+def test_a_map_is_chosen_and_levelled_and_its_lights_are_ordered(browser, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "edit.toml").write_text(SMALL)
+    images.write_exr("sky.exr", analytic_sky.sunsky(64, 200, 30, 3), {})
+    images.write_exr("picture.exr", np.ones((30, 40, 3)), panorama=False)
+    kept = tmp_path / "edit_out" / "painted.toml"
+    with served(None) as server:
+        page = Page(browser, server.url)
+        tile = page.page.get_by_role("button", name="sky.exr")
+        sync_api.expect(tile.locator("img")).to_have_attribute("src", re.compile("^data:image/png"))
+        sync_api.expect(page.page.get_by_role("button", name="picture.exr")).to_be_hidden()
+        shown = "() => [...document.querySelectorAll('.tiles img[src]')].every((e) => e.naturalWidth > 0)"
+        page.page.wait_for_function(shown)
+        tile.click()
+        sync_api.expect(tile).to_have_attribute("aria-pressed", "true")
+        page.shot("start")
+        assert not page.page.evaluate(UNNAMED)
+        assert not page.page.evaluate(FAINT)
+        page.page.get_by_test_id("open-name").fill("edit.toml")
+        page.page.get_by_test_id("open").click()
+        page.page.wait_for_function("() => envedit.log.some((e) => e.frame)")
+        map_is_levelled(page, kept, server.worker.session)
+        assert config.load(kept).input.envmap == str(tmp_path / "sky.exr")
+        lights_are_ordered(page, kept)
+        assert not page.faults, page.faults
+
+
 def test_views_as_tabs_names_focus_order_and_contrast(browser, tmp_path):
     write_scene(tmp_path, *TWO_VIEWS, LIGHT, name="scene.xml")
     (tmp_path / "edit.toml").write_text(OF_TWO)
@@ -472,3 +565,40 @@ def test_a_photograph_is_compared_with_the_rendering(browser, tmp_path):
         get("reference").select_option("0")
         assert page.picture("render") != photograph
         assert not page.faults, page.faults
+
+
+def test_fingers_paint_and_zoom_on_a_tablet(browser, tmp_path):
+    (tmp_path / "edit.toml").write_text(SMALL)
+    kept = tmp_path / "edit_out" / "painted.toml"
+    with served(tmp_path / "edit.toml") as server:
+        context = browser.new_context(viewport={"width": 820, "height": 1180}, has_touch=True)
+        page = Page(browser, server.url, context.new_page())
+        sync_api.expect(page.page.get_by_test_id("handle-1")).to_be_visible(timeout=120_000)
+        touch = context.new_cdp_session(page.page)
+
+        def fingers(kind, *places):
+            points = [dict(zip("xy", page.at("#overlay", *place), strict=True)) for place in places]
+            touch.send("Input.dispatchTouchEvent", {"type": f"touch{kind}", "touchPoints": points})
+
+        # ---- One paints
+        fingers("Start", (0.2, 0.8))
+        for k in range(6):
+            fingers("Move", (0.2 + 0.08 * k, 0.8))
+        fingers("End")
+        until(lambda: kept.exists() and kept.read_text().count("[[target.strokes]]") == 1)
+        # ---- Two zoom, and paint nothing; nothing is cut off, held upright or level
+        fingers("Start", (0.4, 0.5))
+        fingers("Start", (0.4, 0.5), (0.6, 0.5))
+        for k in range(6):
+            fingers("Move", (0.4 - 0.02 * k, 0.5), (0.6 + 0.02 * k, 0.5))
+        fingers("End")
+        page.page.wait_for_function(
+            "() => document.querySelector('.zoomed').style.transform.includes('scale')"
+        )
+        assert kept.read_text().count("[[target.strokes]]") == 1
+        for width, height in ((820, 1180), (1024, 768)):
+            page.page.set_viewport_size({"width": width, "height": height})
+            assert page.page.evaluate("document.documentElement.scrollWidth") == width
+        page.shot("tablet")
+        assert not page.faults, page.faults
+        context.close()

@@ -132,13 +132,17 @@ def test_a_shadow_is_dragged_by_its_tip(painting):
         return heard.last["picked"]
 
     for turn, (tip, there) in DRAGGED.items():
-        session.update(Edit(document({"rotate_degrees": turn})))
+        level = {"rotate_degrees": turn, "tilt_degrees": 3.0}
+        session.update(Edit(document(level)))
         before = session.base[:, :, 1].copy()
+        ((sun, share),) = picked(45, 45, of="shares")["shares"]
+        ((_, shaded),) = picked(*tip, of="shares")["shares"]
+        assert sun == 0 and 0.3 < share < 1 and shaded < 0.1, "whose light it is"
         found = picked(*tip)
         assert found["light"] == 0 and len(found["point"]) == 3
         to = picked(*there, light=0, point=tuple(found["point"]))
         light = {"light": 1, "azimuth": to["azimuth"], "elevation": to["elevation"]}
-        session.update(Edit(document({"rotate_degrees": turn, "lights": [light]})))
+        session.update(Edit(document(level | {"lights": [light]})))
         after = session.base[:, :, 1]
         assert after[there] < 0.5 * before[there], "the shadow is not where it was dragged to"
         assert after[tip] > before[tip]
@@ -146,7 +150,7 @@ def test_a_shadow_is_dragged_by_its_tip(painting):
         # ---- A click does the same with the strongest light; to illuminate, one is to be added
         to = picked(*tip, of="cast")
         light |= {"azimuth": to["azimuth"], "elevation": to["elevation"]}
-        session.update(Edit(document({"rotate_degrees": turn, "lights": [light]})))
+        session.update(Edit(document(level | {"lights": [light]})))
         assert to["light"] == 0 and session.base[tip][1] < 0.5 * after[tip], "the shadow does not fall there"
         added = picked(20, 24, of="illuminate")
         assert added["light"] == -1 and -90 <= added["elevation"] <= 90

@@ -16,9 +16,11 @@ import pytest
 from envedit import api, config, inputs, pipeline
 from envedit.core import color, interrupts, latlong
 from envedit.core.errors import InputError
+from envedit.core.rotations import Orientation
 from envedit.images import analytic_sky, images
 from envedit.losses.perceptual import installed
 from envedit.representations.layers import gain
+from envedit.representations.layers.placed_lights import angles, direction
 from envedit.scene import scene
 from envedit.solve import (
     adam_loop,
@@ -278,11 +280,8 @@ def test_paint_is_explained_by_lights_where_adam_is_to_make_no_step(tmp_path, rn
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "mask",
-    [None, pytest.param("mask.exr", marks=pytest.mark.xfail(reason="the sun dims and does not move"))],
-)
-def test_layers_follow_a_painted_picture_and_its_mask(mask, tmp_path):
+@pytest.mark.xfail(reason="the sun dims and does not move")
+def test_layers_follow_a_painted_picture_and_its_mask(tmp_path):
     """Painted: the ball under a sun elsewhere, a black bar across it, which the mask leaves out."""
     picture, wanted = np.full((16, 32, 3), 0.3, np.float32), np.full((16, 32, 3), 0.3, np.float32)
     picture[4, 20], wanted[4, 4] = 60, 60
@@ -295,21 +294,18 @@ def test_layers_follow_a_painted_picture_and_its_mask(mask, tmp_path):
     painted[8:13], counted[8:13] = 0, 0
     images.write_exr(tmp_path / "painted.exr", painted)
     images.write_exr(tmp_path / "mask.exr", counted)
-    target = {"kind": "image", "file": "painted.exr"} | ({"mask": mask, "hold": 0.0} if mask else {})
+    target = {"kind": "image", "file": "painted.exr", "mask": "mask.exr", "hold": 0.0}
     found = pipeline.run(settings_of(tmp_path, picture, target=target, **tables))
     rest = counted[..., 0] > 0
 
     def error(name):
         return np.square(found.renders[name] - painted)[rest].mean()
 
-    if mask:
-        assert error("edited") < 0.1 * error("initial")
-        assert found.metrics["envmap"] is None
-        peak = np.unravel_index(found.envmap.sum(axis=2).argmax(), (16, 32))
-        assert abs(peak[0] - 4) <= 2 and abs(peak[1] - 4) <= 2
-        assert_variants(found, tmp_path, settings_of(tmp_path, picture, target=target, **tables))
-    else:  # without it the black bar counts
-        assert error("edited") > 0.02 * error("initial")
+    assert error("edited") < 0.1 * error("initial")
+    assert found.metrics["envmap"] is None
+    peak = np.unravel_index(found.envmap.sum(axis=2).argmax(), (16, 32))
+    assert abs(peak[0] - 4) <= 2 and abs(peak[1] - 4) <= 2
+    assert_variants(found, tmp_path, settings_of(tmp_path, picture, target=target, **tables))
 
 
 def assert_variants(found, folder, settings):
@@ -503,12 +499,10 @@ def test_weights_that_are_not_there_are_refused_before_anything_is_rendered(tmp_
 # ---- stopping and continuing -----------------------------------------------------------------------------
 
 CASES = {
-    "pixels, columns": (sunny, PIXELS),
-    "pixels, no columns": (smooth, PIXELS | {"optimizer": {"iterations": 20, "lr": 1e-4}}),
     "siren, columns": (sunny, {"representation": {"kind": "siren", "hidden": 16, "depth": 1}}),
-    "layers, transport recorded afresh": (
+    "pixels, transport recorded afresh": (
         sunny,
-        ADAM | {"renderer": {"spp": 32, "max_depth": 3, "refresh": 6}},
+        PIXELS | {"renderer": {"spp": 32, "max_depth": 3, "refresh": 6}},
     ),
     "layers, painted, columns": (
         sunny,
@@ -523,9 +517,6 @@ def test_an_interrupted_run_ends_with_the_same_bits(name, tmp_path, rng, monkeyp
     """Interrupted after 13 and all 20 steps; 13 is no multiple of what the transport counts in."""
     make, tables = CASES[name]
     picture = make(rng)
-    if name == "pixels, no columns":  # an even map turned is the same map: ask for one twice as bright
-        images.write_exr(tmp_path / "bright.exr", 2 * picture)
-        tables = tables | {"target": {"file": "bright.exr"}}
     settings = settings_of(tmp_path, picture, **tables)
     whole = pipeline.run(settings)
     assert (whole.envmap != picture).any()
@@ -543,8 +534,7 @@ def test_an_interrupted_run_ends_with_the_same_bits(name, tmp_path, rng, monkeyp
             assert json.loads(stored["meta"].tobytes())["state"]["step"] == step
         assert [path.name for path in folder.iterdir()] == [checkpoint.NAME]
         if "columns" in name:
-            # One column is always traced, in the first step, so that its kernels are there.
-            assert (len(columns) == 1) == ("no columns" in name)
+            assert len(columns) > 1  # one is always traced, in the first step, so that its kernels are there
     assert stop.value.envmap.tobytes() == whole.envmap.tobytes()
 
     resumed = pipeline.run(settings, folder=folder, resume=True)
@@ -566,15 +556,11 @@ def stopping_at(step):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["painted", "a sun of 1e6"])
-def test_an_interrupted_gauss_newton_run_ends_with_the_same_bits(name, tmp_path, rng, monkeypatch):
+def test_an_interrupted_gauss_newton_run_ends_with_the_same_bits(tmp_path, rng, monkeypatch):
     """Interrupted in the first step, in the middle, in the last, and where nothing is left to do."""
-    picture = sunny(rng)
-    if name == "a sun of 1e6":
-        picture[2, 5] = 1e6
-    tables = {"target": {"spp": 16, "kind": "strokes", "strokes": STROKES}} if name == "painted" else {}
+    target = {"spp": 16, "kind": "strokes", "strokes": STROKES}
     monkeypatch.setattr(gauss_newton, "COMPARED_NOISE_RATIO", 0)  # a solution that is no better stays, too
-    settings = settings_of(tmp_path, picture, **tables)
+    settings = settings_of(tmp_path, sunny(rng), target=target)
     whole = pipeline.run(settings)
     steps = len(whole.history)
     assert steps >= 3 and set(whole.history[0]) == {
@@ -838,7 +824,11 @@ def test_a_turned_sky_is_turned_back_to_the_bit(kind, tmp_path, rng):
 def test_lights_before_are_those_of_the_file(tmp_path, rng):
     """Not as they were placed and turned by hand, which is part of how far they have moved."""
     moved = {"light": 1, "azimuth": 200.0, "elevation": 40.0}
-    for by_hand, azimuth in (({"rotate_degrees": 90.0}, 360 * 9.5 / 32 - 90), ({"lights": [moved]}, 200)):
+    levelled, _ = angles(Orientation(horizon=-10.0).matrix @ direction(200.0, 40.0))
+    for by_hand, azimuth in (
+        ({"rotate_degrees": 90.0}, 360 * 9.5 / 32 - 90),
+        ({"lights": [moved], "horizon_degrees": -10.0}, levelled),
+    ):
         settings, _ = turned_world(tmp_path, rng, target={"kind": "none"}, input=by_hand)
         found = pipeline.run(settings)
         (before,), (after,) = (found.lights[name] for name in ("before", "after"))

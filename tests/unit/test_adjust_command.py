@@ -8,9 +8,11 @@ import pytest
 from envedit.cli import adjust
 from envedit.core import latlong, primaries
 from envedit.core.color import luminance
+from envedit.core.rotations import Orientation
 from envedit.images import images
 from envedit.maps import map_file, sphere
 from envedit.maps.adjusted import Adjustments, adjusted
+from envedit.representations.layers import oriented
 
 HEIGHT, WIDTH = 64, 128
 
@@ -33,8 +35,8 @@ def brightest(envmap):
 @pytest.mark.parametrize("angles", [(0, 20, 0), (0, 0, 35), (77.7, -50, 61.3), (0, 180, 0), (0, 0, 90)])
 def test_a_sun_of_one_texel_keeps_its_flux_and_goes_where_it_is_rotated(at, angles, rng):
     envmap = sunny(rng, at)
-    matrix = sphere.rotation(*angles)
-    rotated = sphere.rotate(envmap, matrix)
+    matrix = Orientation(*angles).matrix
+    rotated = oriented.rotate(envmap, matrix)
     sky = flux(np.where(envmap > 1, 0.3, envmap))
     assert rotated.min() >= 0
     np.testing.assert_allclose(flux(rotated) - sky, flux(envmap) - sky, rtol=2e-3)
@@ -44,16 +46,16 @@ def test_a_sun_of_one_texel_keeps_its_flux_and_goes_where_it_is_rotated(at, angl
 def test_what_is_no_light_keeps_its_flux_nearly(rng):
     envmap = np.zeros((HEIGHT, WIDTH, 3), np.float32)
     envmap[24, 50] = 1
-    rotated = sphere.resampled(envmap, sphere.rotation(10, 30, 50), (0, HEIGHT), (0, HEIGHT), 2)
+    rotated = oriented.resampled(envmap, Orientation(10, 30, 50).matrix, (0, HEIGHT), (0, HEIGHT), 2)
     np.testing.assert_allclose(flux(rotated), flux(envmap), rtol=0.04)
 
 
 def test_the_middle_is_raised_and_clockwise_is_clockwise():
     middle, right = np.array([0, 0, 1.0]), np.array([-1.0, 0, 0])
-    assert (sphere.rotation(horizon=30) @ middle)[1] == pytest.approx(0.5)
-    assert (sphere.rotation(tilt=30) @ right)[1] == pytest.approx(-0.5)
+    assert (Orientation(horizon=30).matrix @ middle)[1] == pytest.approx(0.5)
+    assert (Orientation(tilt=30).matrix @ right)[1] == pytest.approx(-0.5)
     d = latlong.directions(HEIGHT, WIDTH)
-    np.testing.assert_allclose(latlong.rotate(d, 90) @ sphere.rotation(turn=90).T, d, atol=1e-12)
+    np.testing.assert_allclose(latlong.rotate(d, 90) @ Orientation(turn=90).matrix.T, d, atol=1e-12)
 
 
 @pytest.mark.parametrize("degrees", [3.0, 20.0, 120.0])

@@ -7,9 +7,10 @@ import pytest
 
 from envedit.cli import blend
 from envedit.core import latlong
-from envedit.export import file_lights, light_list
+from envedit.export import light_list
 from envedit.images import images
 from envedit.maps import blended
+from envedit.representations.layers import file_lights
 
 HEIGHT, WIDTH = 64, 128
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from envedit.core import latlong
+from envedit.core.rotations import Orientation
 from envedit.export import light_list
 from envedit.representations.layers.separation import separate
 
@@ -42,7 +43,7 @@ def test_a_light_that_is_turned_with_its_map_is_the_same_light():
     """Two lights of one flux a turn apart: the first comes to where the second was."""
     before = [light(10, 20), light(50, 20)]
     after = [light(90, 20), light(50, 20)]
-    (first, second) = numbers(light_list.matched(before, after, -40.0))
+    (first, second) = numbers(light_list.matched(before, after, Orientation(-40).matrix))
     expected = math.degrees(2 * math.asin(math.sin(math.radians(20)) * math.cos(math.radians(20))))
     assert (first[0], second[0]) == (2, 1)
     assert first[2] == pytest.approx(expected) and second[2] == pytest.approx(expected)
@@ -55,9 +56,9 @@ def test_a_turn_goes_the_way_of_the_map():
     lists = [light_list.listed(separate(one).lights, one.shape[:2], np.eye(3)) for one in (envmap, turned)]
     assert [len(one) for one in lists] == [2, 2]
     start, end = (np.array([one["direction"] for one in lights]) for lights in lists)
-    np.testing.assert_allclose(light_list._turned(start, 45.0), end, atol=1e-4)
+    np.testing.assert_allclose(start @ Orientation(45).matrix.T, end, atol=1e-4)
     np.testing.assert_allclose(start[0], latlong.directions(HEIGHT, WIDTH)[9, 50], atol=1e-4)
-    assert [row[0] for row in numbers(light_list.matched(*lists, 45.0))] == [1, 2]
+    assert [row[0] for row in numbers(light_list.matched(*lists, Orientation(45).matrix))] == [1, 2]
 
 
 @pytest.mark.parametrize("changed", [False, True])
@@ -73,7 +74,7 @@ def test_a_light_that_the_edit_left_alone_is_the_same_light(changed):
     assert len(before.lights) == 1 and not after.lights
     found = light_list.kept(before, after, envmap, turned, degrees)
     lists = [light_list.listed(one.lights, one.core.shape[:2], np.eye(3)) for one in (before, found)]
-    said = light_list.summary(light_list.matched(*lists, degrees), HEIGHT)
+    said = light_list.summary(light_list.matched(*lists, Orientation(degrees).matrix), HEIGHT)
     azimuth = round(50.5 / WIDTH * 360 - degrees)
     assert "is gone" in said if changed else f"to azimuth {azimuth}, elevation" in said
     np.testing.assert_array_equal(found.core, 0 if changed else latlong.rotate(before.core, degrees))

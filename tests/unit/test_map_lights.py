@@ -8,9 +8,10 @@ import pytest
 
 from envedit.cli import lights
 from envedit.core import latlong, primaries
-from envedit.export import file_lights, light_list
+from envedit.export import light_list
 from envedit.images import images
 from envedit.maps import map_lights
+from envedit.representations.layers import file_lights
 from envedit.representations.layers.separation import separate
 
 HEIGHT, WIDTH = 48, 96

@@ -5,6 +5,7 @@ import os
 import resource
 import struct
 from pathlib import Path
+from types import SimpleNamespace
 
 import drjit as dr
 import mitsuba as mi
@@ -13,7 +14,7 @@ import pytest
 
 from envedit import config
 from envedit.cli import paint
-from envedit.cli.paint import project, protocol, session, worker
+from envedit.cli.paint import picking, project, protocol, session, worker
 from envedit.cli.paint.session import Tell
 from envedit.core.errors import ConfigError, InputError
 from tests.oracles.devices import on_cpu
@@ -72,6 +73,34 @@ def test_a_document_goes_through_json_unchanged():
     assert protocol.document(json.loads(json.dumps(edit.document.plain()))) == edit.document
 
 
+def test_lights_are_listed_in_the_order_of_their_tables_once_each_has_one():
+    layers = SimpleNamespace(lights=SimpleNamespace(flux=np.ones((2, 3))))
+    placed = SimpleNamespace(lights=[SimpleNamespace(direction=np.eye(3)[i]) for i in (0, 1)], layers=layers)
+    added, second, first = {"azimuth": 1, "elevation": 2, "flux": [1.0] * 3}, {"light": 2}, {"light": 1}
+
+    def listed(*lights):
+        document = protocol.document({"lights": lights})
+        found = picking.lights(placed, document)
+        entries = picking.changed(found, 0, {"muted": True}, document)
+        return [one.entry.get("light") for one in found], [one.get("light") for one in entries]
+
+    assert listed(added, second) == ([1, 2, None], [1, 2, None])
+    assert listed(added) == ([1, 2, None], [1, None])
+    assert listed(added, second, first) == ([None, 2, 1], [None, 2, 1])
+    assert listed(second, {"light": 7}, first) == ([2, 1], [2, 1, 7]), "a light that the map has not is gone"
+
+
+def test_names_roles_and_order_move_no_light():
+    moved = {"azimuth": 1, "elevation": 2, "flux": [1.0] * 3}
+    labelled = [{"light": 1, "role": "key"}, moved | {"name": "softbox", "role": "rim"}]
+    plain, other = ({"lights": [moved]}, {"lights": [moved | {"size": 3}]})
+    placing = protocol.document(plain).placing
+    assert protocol.document({"lights": labelled}).placing == placing
+    assert protocol.document({"lights": labelled[::-1]}).placing == placing
+    assert protocol.document(other).placing != placing
+    assert protocol.document(plain | {"tilt_degrees": 1}).placing != placing
+
+
 def test_a_frame_holds_half_floats_and_nothing_that_is_not_finite():
     image = np.float32([[[0.5, 1e6, np.nan], [np.inf, -np.inf, 1e-30]]])
     frame = protocol.frame("map", "mitsuba", 2**32 + 5, image)
@@ -88,10 +117,10 @@ def test_painted_toml_is_what_was_given_and_what_was_painted(tmp_path):
     assert (
         opened.document == protocol.Document() and opened.folder == tmp_path / "edit_out" and not opened.again
     )
-    light = {"azimuth": 10.0, "elevation": 20.0, "flux": [1, 2, 3]}
+    light = {"azimuth": 10.0, "elevation": 20.0, "flux": [1, 2, 3], "role": "rim"}
     done = protocol.document(
         {"strokes": [STROKE], "lights": [light], "rotate_degrees": 30, "exposure": 0.5, "temperature": 5000}
-        | {"rest": "keep", "freedom": 0.5}
+        | {"rest": "keep", "freedom": 0.5, "tilt_degrees": -3.5, "horizon_degrees": 2}
     )
     opened.keep(done)
     again = project.opened(str(file))
@@ -99,6 +128,7 @@ def test_painted_toml_is_what_was_given_and_what_was_painted(tmp_path):
     assert project.opened(str(opened.folder / "painted.toml")).document == done
     settings = config.load(opened.folder / "painted.toml")
     assert (settings.seed, settings.input.width, settings.target.hold) == (4, 64, 2)
+    assert settings.input.orientation == (30, -3.5, 2) and settings.input.lights[0]["role"] == "rim"
     assert settings.loss.given == frozenset(), "a default was written as if it had been given"
     opened.keep(protocol.Document())
     assert config.load(opened.folder / "painted.toml").target.kind == "none"

@@ -664,7 +664,7 @@ def exported(made=None, **of_run):
 @pytest.mark.parametrize(
     ("given", "key"),
     [({"input": {"width": 128}}, "input.width 256"), ({"target": {"spp": 64}}, "target.spp auto"),
-     ({"seed": 4}, "seed 0")],
+     ({"input": {"tilt_degrees": 3.0}}, "input.tilt_degrees 0.0"), ({"seed": 4}, "seed 0")],
 )  # fmt: skip
 def test_a_picture_of_another_rendering_is_refused(drops, given, key, initial, tmp_path):
     made = config.Config()

@@ -17,6 +17,7 @@ from envedit.representations.layers.lights import DARK, LOBE_DEGREES
 from envedit.solve import painted_places
 from envedit.solve.feasibility import WARNED_SHARE, Reach
 from envedit.solve.map_problem import SIGMA, Problem
+from envedit.solve.unknowns import with_light
 
 UNLIT_SHARE = 0.02
 """Light of a white sky at a stroke, over the picture's mean, below which hardly any of the map's reaches it.
@@ -210,21 +211,16 @@ def _placed(problem, start, state, painted, listed, document):
     # ---- The strongest light, elsewhere
     i = None if strongest is None else picking.index_of(listed, layers.centres[strongest])
     if i is not None:
-        dark = _with(start, strongest, flux=DARK)
+        dark = with_light(start, strongest, flux=DARK)
         away = problem.direction(state, strongest)
         share, toward, factor = _best(problem, dark, start, strongest, painted, away)
         if toward is not None:
-            entry = listed[i].entry
-            flux = [factor * value for value in entry["flux"]]
-            others = [light for light in document.lights if light is not entry]
-            yield (
-                share,
-                f"Drag light {i + 1}",
-                [*others, entry | {"flux": flux} | picking.place(toward, document)],
-            )
+            flux = [factor * value for value in listed[i].entry["flux"]]
+            moved = {"flux": flux} | picking.place(toward, document)
+            yield share, f"Drag light {i + 1}", picking.changed(listed, i, moved, document)
     # ---- One more
     spare, size = layers.own, layers.log_size(LOBE_DEGREES)
-    lobe = _with(start, spare, size=size)
+    lobe = with_light(start, spare, size=size)
     share, toward, factor = _best(problem, start, lobe, spare, painted)
     if toward is not None:
         flux = (factor * layers.flux[spare]).tolist()
@@ -240,7 +236,7 @@ def _best(problem, without, start, k, painted, away=None):
     best: tuple[float, np.ndarray | None, float] = 0.0, None, 1.0
     for toward, log_flux, _ in painted_places.best(problem, without, k, SIGMA, away):
         turn = rotation_vector(problem.layers.lights.centres[k], toward)
-        rendering = problem.evaluate(_with(start, k, turn=turn, flux=log_flux)).rendering
+        rendering = problem.evaluate(with_light(start, k, turn=turn, flux=log_flux)).rendering
         share = 0.0 if rendering is None else painted.reached(rendering)
         if share > best[0]:
             best = share, toward, float(np.exp(log_flux[0]))
@@ -249,11 +245,3 @@ def _best(problem, without, start, k, painted, away=None):
 
 def _percent(share):
     return f"{100 * share:.0f} %"
-
-
-def _with(state, k, **values):
-    """Return a state with other values of one light."""
-    found = {name: value.copy() for name, value in state.items()}
-    for name, value in values.items():
-        found[name][k] = value
-    return found

@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from envedit.cli.paint.protocol import Document, Pick
+from envedit.cli.paint.protocol import Document, Pick, unchanged
 from envedit.core import latlong
 from envedit.core.arrays import tensor
 from envedit.core.rows import Rows
+from envedit.representations.layers.oriented import oriented
 from envedit.representations.layers.placed_lights import PlacedLights, angles, direction, flux_of
 from envedit.scene import highlight, placement, shadow
 from envedit.scene.camera_paths import NoPlaceError
@@ -30,7 +31,7 @@ SAME_LIGHT = np.cos(np.radians(10.0))
 
 @dataclass(frozen=True)
 class Placed:
-    """A light as a document has it: direction (3,) in the turned map, flux (3,), and its entry."""
+    """A light as a document has it: direction (3,) in the rotated map, flux (3,), and its entry."""
 
     direction: np.ndarray
     flux: np.ndarray
@@ -38,20 +39,39 @@ class Placed:
 
 
 def lights(placed: PlacedLights, document: Document) -> list[Placed]:
-    """List the lights of a document: the map's own, then those that were added."""
-    entries = {light["light"]: light for light in document.lights if "light" in light}
+    """List the lights of a document, in the order of the page (``page/lights.js``).
+
+    That is the map's own by their numbers, then those that were added; where the document has an entry for
+    each of the map's own, the order of the entries.
+    """
+    own = len(placed.lights)
+    known = [entry for entry in document.lights if entry.get("light", 0) <= own]
+    entries = {entry["light"]: entry for entry in known if "light" in entry}
+    if len(entries) < own:
+        first = [entries.get(i + 1, unchanged(i + 1)) for i in range(own)]
+        known = first + [entry for entry in known if "light" not in entry]
+
+    rotation = document.orientation.matrix
     found = []
-    for i, light in enumerate(placed.lights):
-        entry = entries.get(i + 1, {"light": i + 1, "flux": (1.0, 1.0, 1.0), "size": 1.0})
-        where = (entry["azimuth"], entry["elevation"]) if "azimuth" in entry else angles(light.direction)
-        found.append((where, placed.layers.lights.flux[i] * flux_of(entry), entry))
-    added = [light for light in document.lights if "light" not in light]
-    found += [((light["azimuth"], light["elevation"]), flux_of(light), light) for light in added]
-    turned = document.rotate_degrees
-    return [
-        Placed(direction(azimuth - turned, elevation), flux, entry)
-        for (azimuth, elevation), flux, entry in found
+    for entry in known:
+        toward, flux = None, flux_of(entry)
+        if "light" in entry:
+            toward = placed.lights[entry["light"] - 1].direction
+            flux = placed.layers.lights.flux[entry["light"] - 1] * flux
+        if "azimuth" in entry:
+            toward = direction(entry["azimuth"], entry["elevation"])
+        found.append(Placed(rotation @ toward, flux, entry))
+    return found
+
+
+def changed(listed: Sequence[Placed], index: int, change: dict[str, Any], document: Document) -> list[dict]:
+    """Return the document's entries with a change of one of its listed lights, in the order of the list."""
+    entries = [
+        light.entry | change if i == index else light.entry
+        for i, light in enumerate(listed)
+        if i == index or light.entry in document.lights
     ]
+    return entries + [entry for entry in document.lights if not any(entry is one.entry for one in listed)]
 
 
 def index_of(listed: Sequence[Placed], toward: np.ndarray) -> int | None:
@@ -62,8 +82,8 @@ def index_of(listed: Sequence[Placed], toward: np.ndarray) -> int | None:
 
 def place(toward: np.ndarray, document: Document) -> dict[str, float]:
     """Return ``azimuth`` and ``elevation`` of an entry of the document whose light is to stand there."""
-    azimuth, elevation = angles(toward)
-    return {"azimuth": (azimuth + document.rotate_degrees) % 360, "elevation": elevation}
+    azimuth, elevation = angles(toward @ document.orientation.matrix)
+    return {"azimuth": azimuth, "elevation": elevation}
 
 
 class Picking:
@@ -108,7 +128,7 @@ class Picking:
                 return found | {"text": "the light would stand where [input] rows keeps the map"}
             return found | place(toward, document)
         if asked.of == "highlight":
-            return {"light": self._lit_by(self._seen(view, asked.x, asked.y), document)}
+            return {"light": self._lit_by(self.seen(view, asked.x, asked.y), document)}
         return self._shadowed(asked, view, shown)
 
     def _direction(self, asked, view, shown):
@@ -139,7 +159,7 @@ class Picking:
                 text = f"light {i + 1}: {reason}" if text == "the map has no light" else text
         return {"light": -1, "text": text}
 
-    def _seen(self, view, x, y):
+    def seen(self, view: int, x: float, y: float) -> np.ndarray:
         """Return how much light each texel gives to the pixels around a place, (H, W): rows of T."""
         patch = np.zeros((self.scene.height, self.scene.width, 3), np.float32)
         seen = patch[self.scene.rows[view]]
@@ -150,22 +170,12 @@ class Picking:
 
     def _lit_by(self, seen, document):
         """Return the index of the light of the document that adds most at a pixel; -1 without lights."""
-        degrees, best, most = document.rotate_degrees, -1, 0.0
-        dark = [{**light, "flux": [0.0] * 3} for light in document.lights if "light" in light]
-        named = {light["light"] for light in dark}
-        dark += [{"light": i + 1, "flux": [0.0] * 3, "size": 1.0} for i in range(len(self.placed.lights))
-                 if i + 1 not in named]  # fmt: skip
-        added = [light for light in document.lights if "light" not in light]
+        best, most = -1, 0.0
+        listed = lights(self.placed, document)
         whole = self.placed.place(document.lights)
-        for i in range(len(self.placed.lights) + len(added)):
-            if i < len(self.placed.lights):
-                out = [one for one in dark if one["light"] == i + 1]
-                kept = [one for one in document.lights if one.get("light") != i + 1]
-                without = self.placed.place([*kept, *out])
-            else:
-                gone = added[i - len(self.placed.lights)]
-                without = self.placed.place([one for one in document.lights if one is not gone])
-            lost = latlong.rotate(whole - without, degrees).mean(axis=2)
+        for i in range(len(listed)):
+            without = self.placed.place(changed(listed, i, {"muted": True}, document))
+            lost = oriented(whole - without, document.orientation, []).mean(axis=2)
             share = float((seen * lost).sum())
             if share > most:
                 best, most = i, share

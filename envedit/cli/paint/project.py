@@ -11,7 +11,7 @@ from pathlib import Path
 
 from envedit import config
 from envedit.cli import run
-from envedit.cli.paint.protocol import Document
+from envedit.cli.paint.protocol import ORIENTATION, Document
 from envedit.core import array_cache, atomic_files, file_locks
 from envedit.core.errors import ConfigError, InputError
 
@@ -73,7 +73,7 @@ class Project:
         if "parameters" in given["scene"]:
             named = given["scene"]["parameters"]
             given["scene"]["parameters"] = {key: self._found(value) for key, value in named.items()}
-        own = {"rotate_degrees": document.rotate_degrees} if document.rotate_degrees else {}
+        own = {name: value for name in ORIENTATION if (value := getattr(document, name))}
         given["input"] = {"envmap": settings.input.envmap} | given["input"] | own
         if document.rest != settings.target.rest:
             given["target"]["rest"] = document.rest
@@ -180,7 +180,7 @@ def opened(name: str, envmap: str = "", preset: str | None = None, camera: str =
         strokes=settings.target.strokes if settings.target.kind == "strokes" else (),
         lights=settings.input.lights,
         regions=settings.input.regions,
-        rotate_degrees=settings.input.rotate_degrees,
+        **{name: getattr(settings.input, name) for name in ORIENTATION},
         exposure=settings.output.exposure,
         temperature=settings.output.temperature,
         rest=settings.target.rest,
@@ -220,7 +220,7 @@ def _plain(settings, folder):
     """Return settings without what the document has."""
     return replace(
         settings,
-        input=_without(settings.input, "lights", "regions", "rotate_degrees"),
+        input=_without(settings.input, "lights", "regions", *ORIENTATION),
         output=_without(settings.output, "exposure", "temperature", dir=str(folder)),
         target=_without(settings.target, "kind", "strokes", "file", "mask", "rotate_degrees", "rest"),
         solve=_without(settings.solve, "freedom"),
@@ -251,11 +251,19 @@ def _continued(project):
 
 
 def recent() -> list[dict]:
-    """List what was painted lately, the last first: ``path`` of ``painted.toml``, ``title``."""
+    """List what was painted lately, the last first: ``path`` of ``painted.toml``, ``title``, ``picture``.
+
+    That is the rendering that was saved, "" where none was.
+    """
     with contextlib.suppress(OSError, ValueError, TypeError, KeyError, AttributeError):
         listed = json.loads(_recent_file().read_text(encoding="utf-8"))
         found = [{"path": str(one["path"]), "title": str(one["title"])} for one in listed]
-        return [one for one in found if Path(one["path"]).is_file()][:_RECENT]
+        there = [one for one in found if Path(one["path"]).is_file()][:_RECENT]
+        pictures = [Path(one["path"]).with_name("render_edited.exr") for one in there]
+        return [
+            one | {"picture": str(picture) if picture.is_file() else ""}
+            for one, picture in zip(there, pictures, strict=True)
+        ]
     return []
 
 

@@ -18,9 +18,11 @@ from envedit.config.key_validators import Kelvin
 from envedit.config.light_schema import LightList
 from envedit.config.method_schema import Solve
 from envedit.config.region_schema import RegionList
+from envedit.config.schema import FIELDS
 from envedit.config.stroke_schema import StrokeList
 from envedit.config.validators import Choice, Number, String, WantedError, show
 from envedit.core.errors import ConfigError
+from envedit.core.rotations import Orientation
 
 MOST_BYTES = 1 << 20
 """Length of a message from the page."""
@@ -29,11 +31,18 @@ MOST_STROKES, MOST_POINTS = 500, 20_000
 KINDS = (
     "render", "map", "difference", "unreachable", "before", "explanation", "sky", "sky-before", "photograph",
 )  # fmt: skip
+ORIENTATION = ("rotate_degrees", "tilt_degrees", "horizon_degrees")
+"""Keys of ``[input]`` that a document has, in the order of :class:`.Orientation`."""
 SOURCES = ("transport", "mitsuba", "saved")
 PHASES = ("drawing", "dragging", "done")
 """A stroke is being drawn, a light is being dragged, or neither."""
 _LARGEST = 65504.0
 _FAR = 1e30
+
+
+def unchanged(number: int | None) -> dict[str, Any]:
+    """Return the entry of a light of the map, by its number, that is as the map has it."""
+    return {"light": number, "flux": [1.0] * 3, "size": 1.0}
 
 
 class BadMessageError(ValueError):
@@ -50,8 +59,8 @@ class Document:
         As in ``[[target.strokes]]``.
     lights, regions : tuple of dict
         As in ``[[input.lights]]`` and ``[[input.regions]]``.
-    rotate_degrees : float
-        ``[input] rotate_degrees``.
+    rotate_degrees, tilt_degrees, horizon_degrees : float
+        As in ``[input]``.
     exposure, temperature : float
         As in ``[output]``.
     rest : str
@@ -64,6 +73,8 @@ class Document:
     lights: tuple[dict, ...] = ()
     regions: tuple[dict, ...] = ()
     rotate_degrees: float = 0.0
+    tilt_degrees: float = 0.0
+    horizon_degrees: float = 0.0
     exposure: float = 0.0
     temperature: float = 0.0
     rest: str = Target.rest
@@ -71,9 +82,19 @@ class Document:
 
     @property
     def placing(self) -> tuple:
-        """What decides what the map is before paint: not the names of its lights."""
-        lights = [{key: value for key, value in light.items() if key != "name"} for light in self.lights]
-        return lights, self.regions, self.rotate_degrees
+        """What decides what the map is before paint: not the names, roles and order of its lights."""
+        lights = [
+            {key: value for key, value in light.items() if key not in ("name", "role")}
+            for light in self.lights
+        ]
+        changed = [light for light in lights if light != unchanged(light.get("light"))]
+        placed = sorted(json.dumps(light, sort_keys=True) for light in changed)
+        return placed, self.regions, self.orientation
+
+    @property
+    def orientation(self) -> Orientation:
+        """How the map is rotated as a whole, after its lights are placed."""
+        return Orientation(self.rotate_degrees, self.tilt_degrees, self.horizon_degrees)
 
     def plain(self) -> dict:
         """Return it as JSON has it."""
@@ -84,7 +105,7 @@ _CHECKS = {
     "strokes": StrokeList(),
     "lights": LightList(),
     "regions": RegionList(),
-    "rotate_degrees": Number(-360, 360),
+    **{name: FIELDS["input"][name].metadata["check"] for name in ORIENTATION},
     "exposure": Number(-20, 20),
     "temperature": Kelvin(),
     "rest": Choice("follow", "keep"),
@@ -136,13 +157,17 @@ class Edit:
     painting: int = 0
 
 
+PICKED = ("highlight", "shadow", "illuminate", "rim", "cast", "shares")
+
+
 @dataclass(frozen=True)
 class Pick:
     """A place on the rendering of a view (shares of width and height) that a light is dragged from, or to.
 
     ``light`` is the index of the light that follows, in the order of the ``lights`` message; -1: the server
     chooses. ``of`` is what is dragged, a "highlight" or a "shadow", and ``point`` what casts the shadow; or
-    what the light is placed to do, to "illuminate", to "rim" or to "cast" a shadow there.
+    what the light is placed to do, to "illuminate", to "rim" or to "cast" a shadow there; or "shares" of
+    light are asked for.
     """
 
     x: float
@@ -206,7 +231,7 @@ def read(text: str | bytes, client: str = "") -> Edit | Pick | Choose | Open | S
             x, y = (Number(0, 1)(found.get(name)) for name in "xy")
             light = int(Number(-1, 100)(found.get("light", -1)))
             view = _count(found.get("view", 0))
-            of = Choice("highlight", "shadow", "illuminate", "rim", "cast")(found.get("of", "highlight"))
+            of = Choice(*PICKED)(found.get("of", "highlight"))
             number = _count(found.get("number", 0))
             return Pick(x, y, light, number, client, view, of, _point(found.get("point", [])))
         if kind == "open":

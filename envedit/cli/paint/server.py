@@ -10,6 +10,7 @@ import asyncio
 import contextlib
 import filecmp
 import hmac
+import os
 import re
 import secrets
 import socket
@@ -22,7 +23,7 @@ from starlette.responses import FileResponse, PlainTextResponse, Response
 from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from envedit.cli.paint import project, protocol
+from envedit.cli.paint import project, protocol, thumbnails
 from envedit.cli.paint.session import Tell
 from envedit.cli.paint.worker import Again, Worker
 from envedit.core import shipped
@@ -31,7 +32,13 @@ from envedit.report import output_folder
 
 HOST = "127.0.0.1"
 PAGE = Path(__file__).parent / "page"
-TYPES = {".html": "text/html", ".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
+TYPES = {
+    ".html": "text/html",
+    ".js": "text/javascript",
+    ".css": "text/css",
+    ".svg": "image/svg+xml",
+    ".jpg": "image/jpeg",
+}
 MOST_CLIENTS = 8
 LARGEST_MAP = 1 << 30
 """Bytes of a map that is dropped on the page."""
@@ -45,8 +52,8 @@ _SAFE = {
     "Referrer-Policy": "no-referrer",
     "Cache-Control": "no-store",
 }
-_KEPT = ("opened", "lights", "status", "error", "saved", "start")
-"""Kinds of message of which the last is sent to a page that comes later."""
+_KEPT = ("opened", "lights", "status", "error", "saved", "start", "thumbnail")
+"""Kinds of message of which the last is sent to a page that comes later; of thumbnails that of each file."""
 
 
 class Client:
@@ -94,15 +101,18 @@ class Hub(Tell):
         A document goes to all pages but the one that it is of, which has it, and to those that come later.
         """
         kind = message["type"]
+        key = f"thumbnail {message['file']}" if kind == "thumbnail" else kind
         if kind == "status":
             message = {**message, "frame": self.count}
         if kind == "document":
             self.last["opened"] = {**self.last["opened"], "document": message["document"]}
         if kind in _KEPT:
-            self.last[kind] = message
+            self.last[key] = message
         if kind in ("opened", "status"):  # what went wrong before is over
             self.last.pop("error", None)
-        self._send(kind, message)
+        if kind == "opened":
+            self.last = {key: value for key, value in self.last.items() if value["type"] != "thumbnail"}
+        self._send(key, message)
 
     def _send(self, key, value):
         if self.loop is not None:
@@ -145,6 +155,7 @@ class Server:
         self.port, self.token = self.socket.getsockname()[1], token or secrets.token_urlsafe(16)
         self.hub = Hub()
         self.opened, self.worker = opened, Worker(self.hub, opened)
+        self.thumbnails = thumbnails.Thumbnails(self.hub.say)
         if opened is None:
             self.hub.say(_start())
 
@@ -165,7 +176,12 @@ class Server:
         async def lifespan(app):
             self.hub.loop = asyncio.get_running_loop()
             self.worker.start()
+            if self.opened is None:
+                start = self.hub.last["start"]
+                earlier = [(one["picture"], False) for one in start["recent"] if one["picture"]]
+                self.thumbnails.make([*((file, True) for file in start["maps"]), *earlier])
             yield
+            self.thumbnails.stop()
             self.worker.stop()
 
         app = Starlette(
@@ -234,6 +250,8 @@ class Server:
         finally:
             with contextlib.suppress(OSError):
                 part.unlink(missing_ok=True)
+        self.hub.say(_start())
+        self.thumbnails.make([(f"{MAPS}/{name}", True)])
         return PlainTextResponse(f"{MAPS}/{name}", headers=_SAFE)
 
     async def _socket(self, socket: WebSocket) -> None:
@@ -264,6 +282,8 @@ class Server:
                 except protocol.BadMessageError as error:
                     client.put("error", {"type": "refused", "text": str(error)})
                     continue
+                if isinstance(request, protocol.Open):
+                    self.thumbnails.stop()
                 self.worker.post(request)
         except WebSocketDisconnect:
             pass
@@ -295,7 +315,8 @@ def _start():
     """Return what the start page offers."""
     return {
         "type": "start",
-        "scenes": list(shipped.scenes()),
+        "maps": [os.path.relpath(file) for file in thumbnails.maps([Path.cwd(), Path.cwd() / MAPS])],
+        "scenes": list(shipped.complete_scenes()),
         "configurations": [name for name in shipped.configurations() if name.startswith("edits/")],
         "recent": project.recent(),
     }

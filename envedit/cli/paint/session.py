@@ -29,7 +29,7 @@ import numpy as np
 from envedit import inputs, pipeline, renderers
 from envedit.cli.paint import advice, picking
 from envedit.cli.paint.project import MATCHED, SOLUTION, Project
-from envedit.cli.paint.protocol import Document, Edit, Pick
+from envedit.cli.paint.protocol import ORIENTATION, Document, Edit, Pick
 from envedit.core import latlong
 from envedit.core.arrays import tensor
 from envedit.core.color import luminance, tonemap
@@ -43,11 +43,14 @@ from envedit.losses.perceptual import installed
 from envedit.report import output_folder, run_folder
 from envedit.representations.layers import below_horizon
 from envedit.representations.layers.layers import Layers
+from envedit.representations.layers.lights import DARK
+from envedit.representations.layers.oriented import oriented, oriented_share
 from envedit.representations.layers.placed_lights import PlacedLights, angles
 from envedit.representations.layers.unseen import unseen_kept
 from envedit.scene.scene import Scene
 from envedit.solve import checkpoint, feasibility, gauss_newton, hold, map_problem, prior, search
 from envedit.solve.likelihood import Likelihood
+from envedit.solve.unknowns import with_light
 from envedit.targets import strokes, working_size
 from envedit.targets.pixel_weights import first_hold, pixel_weight
 
@@ -220,16 +223,15 @@ class Session:
         self.tell.say({"type": "document", "client": client, "document": self.document.plain()})
 
     def _aim(self, document):
-        """Take lights and turn of a document for the map that is painted on."""
+        """Take lights and orientation of a document for the map that is painted on."""
         self.document, self._dragged = document, False
         self.origin = self._by_hand(document)
         given = self.project.settings.input
         horizon = below_horizon.treatment(given.horizon, given.rows, self.origin)
         kept = map_regions.kept(document.regions, *self.map.shape[:2])
         locked = self.placed.locked(self.placed.locking(document.lights, kept), document.regions)
-        locked, kept = (
-            None if one is None else latlong.rotate(one, document.rotate_degrees) for one in (locked, kept)
-        )
+        locked = None if locked is None else oriented(locked, document.orientation)
+        kept = None if kept is None else oriented_share(kept, document.orientation)
         self.kept = kept
         layers = Layers.of(
             self.origin[self.rows.slice],
@@ -249,9 +251,9 @@ class Session:
         self._paint()
         self._tell_lights()
 
-    def _by_hand(self, document):
+    def _by_hand(self, document, lights=None):
         placed = map_regions.changed(self.placed.place(document.lights), document.regions)
-        return latlong.rotate(placed, document.rotate_degrees)
+        return oriented(placed, document.orientation, lights)
 
     def _drag(self):
         """Show the map with its lights placed, and what paint has added to it before."""
@@ -259,7 +261,7 @@ class Session:
             self._quick.resolve(self.point.edited, limit=COLUMNS)
             self._still_quick = self._quick.apply(tensor(self.point.edited)).numpy()
         self._dragged, self.solving = True, False
-        origin = self._by_hand(self.document)
+        origin = self._by_hand(self.document, lights=[])  # to look for them takes longer than a frame
         found = np.maximum(origin + (self.point.edited - self.origin), 0).astype(np.float32)
         self._quick.probe(self._quick.bright_texels(found)[: min(DRAGGED_COLUMNS, self._quick.capacity)])
         changed = self._quick.apply(tensor(found)).numpy() - self._still_quick
@@ -593,14 +595,9 @@ class Session:
         self._tell_doing("composing the map at the resolution of its file")
         if self._wide is None:
             self._wide = self.given.at_file_size(settings, SKY_WIDTH)
-        by_hand = replace(
-            settings,
-            lights=document.lights,
-            regions=document.regions,
-            rotate_degrees=document.rotate_degrees,
-        )
-        placed = self.placed if document.lights or document.regions else None
-        given = replace(self.given, placed=placed)
+        rotated = {name: getattr(document, name) for name in ORIENTATION}
+        by_hand = replace(settings, lights=document.lights, regions=document.regions, **rotated)
+        given = replace(self.given, placed=self.placed if document.lights or document.regions else None)
         params = self.problem.solution_params(self.run.state)
         edit = file_resolution.Found(self.problem.layers, params, None, 0.0, self.point.edited)
         _, carried = file_resolution.carried(by_hand, given, self._wide, edit, self.origin)
@@ -669,11 +666,32 @@ class Session:
         """Say whose highlight or shadow a pixel shows, or where its light must go (:mod:`.picking`)."""
         answer = {"type": "picked", "number": asked.number, "client": asked.client}
         shown = picking.lights(self.placed, self.document)
-        for k in [] if self._dragged else self.problem.shining(self.still):
-            i = picking.index_of(shown, self.problem.layers.lights.centres[k])
+        centres, solved = self.problem.layers.lights.centres, self.run.state
+        own = {k: picking.index_of(shown, centres[k]) for k in self.problem.shining(self.still)}
+        if asked.of == "shares":
+            added = {k: None for k in self.problem.added(solved)}
+            self.tell.say(answer | self._shares(asked, own | added))
+            return
+        for k, i in {} if self._dragged else own.items():
             if i is not None:  # where paint has put it
-                shown[i] = replace(shown[i], direction=self.problem.direction(self.run.state, k))
+                shown[i] = replace(shown[i], direction=self.problem.direction(solved, k))
         self.tell.say(answer | self.picking.answer(asked, self.document, shown))
+
+    def _shares(self, asked, index):
+        """Return whose light a pixel shows: ``shares`` of the map's lights, by their index in the list.
+
+        ``index`` has that of the layers' lights; -1 is for those that paint has added.
+        """
+        seen = self.picking.seen(min(asked.view, len(self.scene.rows) - 1), asked.x, asked.y)
+        whole = float((seen * self.point.edited.mean(axis=2)).sum())
+        rows = self.rows.slice
+        shares: dict[int, float] = {}
+        for k, i in index.items() if whole > 0 else ():
+            dark = self.problem.params(with_light(self.run.state, k, flux=DARK))
+            lost = (self.point.edited[rows] - self.problem.layers.decode(dark).numpy()).mean(axis=2)
+            i = -1 if i is None else i
+            shares[i] = shares.get(i, 0.0) + float((seen[rows] * lost).sum()) / whole
+        return {"light": max(shares, key=lambda i: shares[i], default=-1), "shares": list(shares.items())}
 
     # ---- results -------------------------------------------------------------------------------------------
 

@@ -1,13 +1,16 @@
-// All lights in a table: name, flux in stops, radius in degrees, kelvin; solo, mute, lock. A click chooses one.
+// All lights in a table: name, role, flux in stops, radius in degrees, kelvin; solo, mute, lock, up and down. A click
+// chooses one.
 
 import { degrees, flux, luminance, off, signed, stops } from "./lights.js";
 
-const COLUMNS = ["", "Name", "Stops", "Radius °", "Kelvin", ""];
+const COLUMNS = ["", "Name", "Role", "Stops", "Radius °", "Kelvin", ""];
 const SWITCHES = [
   ["solo", "S", "Show this light alone, until the next edit"],
   ["mute", "M", "Switch off"],
   ["lock", "L", "The paint leaves this light as it is"],
 ];
+const ROLES = ["", "key", "fill", "rim"]; // as in config/light_schema.py
+const MOVES = [["up", "↑", -1], ["down", "↓", 1]];
 
 export class LightList {
   constructor(holder, lights) {
@@ -43,15 +46,35 @@ export class LightList {
       });
       return made;
     };
-    const chosen = button("choose", i + 1, "Choose its handle on the map", () => this.lights.choose(i));
+    const chosen = button("choose", i + 1, "Choose its handle on the map; Alt with an arrow key moves it in the list", () => this.lights.choose(i));
+    chosen.addEventListener("keydown", (event) => {
+      const by = event.altKey && { ArrowUp: -1, ArrowDown: 1 }[event.key];
+      if (!by) return;
+      event.preventDefault();
+      this.reorder(i, by, (row) => row.chosen);
+    });
+    const role = document.createElement("select");
+    role.append(...ROLES.map((value) => new Option(value || "–", value)));
+    role.dataset.testid = `list-role-${i + 1}`;
+    role.setAttribute("aria-label", `role of light ${i + 1}`);
+    role.addEventListener("focus", () => this.lights.choose(i));
+    role.addEventListener("change", () => this.lights.edit(i, { role: role.value || undefined }));
     const name = input("name", { type: "text", maxLength: 60 }, (_, value) => ({ name: value.trim() || undefined }));
     const stop = input("stops", { type: "number", min: -20, max: 20, step: 0.1 }, (light, value) => ({ flux: limited(light.entry.flux.map((v) => v * 2 ** (value - stops(light, this.lights.unit)))) }));
     const size = input("radius", { type: "number", min: 0.01, max: 90, step: "any" }, (light, value) => ({ size: Math.max(0.01, light.own ? Math.min(20, value / light.own.radius) : Number(value)) }));
     const kelvin = input("kelvin", { type: "number", min: 2000, max: 25000, step: "any" }, (light, value) => this.coloured(light, Number(value)));
     const switches = Object.fromEntries(SWITCHES.map(([key, text, title]) => [key, button(key, text, title, () => this.press(key, i))]));
+    const moves = Object.fromEntries(MOVES.map(([key, text, by]) => [key, button(key, text, `Move ${key} in the list`, () => this.reorder(i, by, (row) => row.moves[key]))]));
     const group = document.createElement("span");
-    group.append(...Object.values(switches));
-    return { cells: [chosen, name, stop, size, kelvin, group], chosen, name, stop, size, kelvin, switches };
+    group.append(...Object.values(switches), ...Object.values(moves));
+    return { cells: [chosen, name, role, stop, size, kelvin, group], chosen, name, role, stop, size, kelvin, switches, moves };
+  }
+
+  // The focus goes with the light.
+  reorder(i, by, control) {
+    if (!this.lights.reorder(i, by)) return;
+    const row = this.rows[i + by], wanted = control(row);
+    (wanted.disabled ? row.chosen : wanted).focus();
   }
 
   press(key, i) {
@@ -70,6 +93,9 @@ export class LightList {
     row.chosen.setAttribute("aria-pressed", String(i === this.lights.chosen));
     write(row.name, light.entry.name ?? "");
     row.name.placeholder = light.own ? `light ${i + 1}` : "added";
+    row.role.value = light.entry.role ?? "";
+    row.moves.up.disabled = i === 0;
+    row.moves.down.disabled = i === this.rows.length - 1;
     write(row.stop, Number.isFinite(value) ? signed(value).replace("−", "-").replace("+", "") : "");
     write(row.size, String(+degrees(light).toPrecision(3)));
     write(row.kelvin, kelvin ? String(Math.round(kelvin / 10) * 10) : "");

@@ -1,6 +1,8 @@
 // The lights of the map as handles, and the panel of the one that is chosen.
 // Entries are as in [[input.lights]]: with `light` one of the map's own, with factors; without it an added one.
 
+import { seen, unseen } from "./orientation.js";
+
 export class Lights {
   constructor(stack, holder, panel, on) {
     Object.assign(this, { stack, holder, panel, on }); // on: document(), preview(change), done(change)
@@ -26,7 +28,8 @@ export class Lights {
     this.draw();
   }
 
-  // All lights as they are: {entry, own, azimuth, elevation, factor}, the map's own first.
+  // All lights as they are: {entry, own, azimuth, elevation, factor}, the map's own first, by their numbers. Where each
+  // of these has an entry in the document, the order is that of the entries (picking.lights of the server is the same).
   list(document = this.draft ?? this.on.document()) {
     const own = this.own.map((light) => {
       const entry = document.lights.find((one) => one.light === light.light) ?? { light: light.light, flux: [1, 1, 1], size: 1 };
@@ -34,18 +37,37 @@ export class Lights {
       return { entry, own: light, azimuth, elevation };
     });
     const added = document.lights.filter((one) => !one.light).map((entry) => ({ entry, own: null, azimuth: entry.azimuth, elevation: entry.elevation }));
-    return [...own, ...added];
+    const all = [...own, ...added], at = (light) => document.lights.indexOf(light.entry);
+    return all.every((light) => at(light) >= 0) ? all.sort((a, b) => at(a) - at(b)) : all;
   }
 
   get unit() { return this.own.length ? Math.max(...this.own[0].flux, 1e-6) : 1; }
 
-  // The document's lights with one of them changed, or left out (null).
+  // The document's lights with one of them changed, or left out (null), in the order of the list.
   changed(index, change) {
-    const document = this.on.document(), light = this.list(document)[index];
-    if (!light) return null;
-    const next = change && { ...light.entry, ...change };
-    if (light.own) return [...document.lights.filter((one) => one.light !== light.entry.light), ...(next ? [next] : [])];
-    return document.lights.flatMap((one) => (one === light.entry ? (next ? [next] : []) : [one]));
+    const { lights } = this.on.document(), all = this.list(this.on.document());
+    if (!all[index]) return null;
+    const entries = all.flatMap(({ entry }, i) => {
+      if (i === index) return change ? [{ ...entry, ...change }] : [];
+      return lights.includes(entry) ? [entry] : [];
+    });
+    return [...entries, ...this.unlisted()];
+  }
+
+  // Entries of lights that the map does not have.
+  unlisted() {
+    const all = this.list(this.on.document());
+    return this.on.document().lights.filter((one) => !all.some(({ entry }) => entry === one));
+  }
+
+  // Change the place of a light in the list; says whether it has another one now.
+  reorder(index, by) {
+    const entries = this.list().map(({ entry }) => entry), to = index + by;
+    if (!entries[to]) return false;
+    entries.splice(to, 0, ...entries.splice(index, 1));
+    this.chosen = to;
+    this.on.done({ lights: [...entries, ...this.unlisted()] });
+    return true;
   }
 
   preview(index, change) {
@@ -68,6 +90,13 @@ export class Lights {
     this.draw();
   }
 
+  // Move a light by degrees on the map as it is seen.
+  moveBy(index, light, dx, dy) {
+    const document = this.on.document(), { azimuth, elevation } = seen(document, light);
+    const there = unseen(document, { azimuth: azimuth + dx, elevation: Math.max(-90, Math.min(90, elevation + dy)) });
+    this.moveTo(index, there.azimuth, there.elevation);
+  }
+
   moveTo(index, azimuth, elevation) {
     this.preview(index, { azimuth: round(((azimuth % 360) + 360) % 360), elevation: round(Math.max(-90, Math.min(90, elevation))) });
   }
@@ -84,14 +113,14 @@ export class Lights {
     event.preventDefault();
     event.stopPropagation();
     this.choose(index);
-    const handle = event.currentTarget, box = this.stack.getBoundingClientRect(), rotate = this.on.document().rotate_degrees;
+    const handle = event.currentTarget, box = this.stack.getBoundingClientRect();
     const light = this.list()[index], start = [event.clientX, event.clientY];
     handle.focus();
     handle.setPointerCapture(event.pointerId);
     handle.onpointermove = (e) => {
       const dx = ((e.clientX - start[0]) / box.width) * 360, dy = ((e.clientY - start[1]) / box.height) * 180;
       if (e.shiftKey || e.ctrlKey) this.stretch(index, light, start[1] - e.clientY, e.ctrlKey);
-      else if (dx || dy) this.moveTo(index, light.azimuth + dx, light.elevation - dy);
+      else if (dx || dy) this.moveBy(index, light, dx, -dy);
     };
     handle.onpointerup = handle.onpointercancel = () => {
       handle.onpointermove = handle.onpointerup = handle.onpointercancel = null;
@@ -102,8 +131,8 @@ export class Lights {
   key(event, index) {
     const move = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] }[event.key];
     if (move) {
-      const step = event.shiftKey ? 5 : 1, light = this.list()[index];
-      this.moveTo(index, light.azimuth + move[0] * step, light.elevation + move[1] * step);
+      const step = event.shiftKey ? 5 : 1;
+      this.moveBy(index, this.list()[index], move[0] * step, move[1] * step);
       this.commit();
     } else if (event.key === "Delete") this.remove();
     else if (event.key === "Enter" || event.key === " ") this.choose(index);
@@ -193,8 +222,8 @@ export class Lights {
   }
 
   add() {
-    const rotate = this.on.document().rotate_degrees, n = this.list().length;
-    this.on.done({ lights: this.withAdded({ azimuth: (180 + rotate + 40 * n + 360) % 360, elevation: 40 }) });
+    const n = this.list().length;
+    this.on.done({ lights: this.withAdded(unseen(this.on.document(), { azimuth: 180 + 40 * n, elevation: 40 })) });
     this.choose(n);
   }
 
@@ -213,9 +242,8 @@ export class Lights {
 
   draw() {
     const document = this.draft ?? this.on.document(), lights = this.list();
-    const place = (element, { azimuth, elevation }, turned) => {
-      const seen = (((azimuth - (turned ? 0 : document.rotate_degrees)) % 360) + 360) % 360;
-      element.style.left = `${(100 * seen) / 360}%`;
+    const place = (element, { azimuth, elevation }) => {
+      element.style.left = `${(100 * azimuth) / 360}%`;
       element.style.top = `${(100 * (90 - elevation)) / 180}%`;
     };
     while (this.holder.querySelectorAll(".handle").length > lights.length) [...this.holder.querySelectorAll(".handle")].at(-1).remove();
@@ -235,8 +263,8 @@ export class Lights {
       const muted = off(light);
       handle.classList.toggle("muted", muted);
       handle.setAttribute("aria-pressed", String(i === this.chosen));
-      handle.setAttribute("aria-label", `${light.own ? "Light" : "Added light"} ${i + 1}${light.entry.name ? `, ${light.entry.name}` : ""}: azimuth ${light.azimuth.toFixed(0)}, elevation ${light.elevation.toFixed(0)} degrees${muted ? ", muted" : ""}; arrow keys move it`);
-      place(handle, light, false);
+      handle.setAttribute("aria-label", `${light.own ? "Light" : "Added light"} ${i + 1}${light.entry.name ? `, ${light.entry.name}` : ""}${light.entry.role ? `, ${light.entry.role} light` : ""}: azimuth ${light.azimuth.toFixed(0)}, elevation ${light.elevation.toFixed(0)} degrees${muted ? ", muted" : ""}; arrow keys move it`);
+      place(handle, seen(document, light));
     });
     this.holder.querySelectorAll(".found").forEach((ring) => ring.remove());
     const solved = !this.draft && document.strokes.length > 0;
@@ -245,7 +273,7 @@ export class Lights {
       const ring = window.document.createElement("span");
       ring.className = "found";
       ring.title = "where the solution has this light";
-      place(ring, light, true);
+      place(ring, light);
       this.holder.append(ring);
     }
     this.fill(lights[this.chosen]);

@@ -1,9 +1,11 @@
 // The page: what is sent when, and what is shown where.
 
+import { Chooser } from "./chooser.js";
 import { Compare } from "./compare.js";
 import { Connection } from "./connection.js";
 import { accelerated, Display } from "./display.js";
 import { EMPTY, History } from "./history.js";
+import { Level } from "./level.js";
 import { LightList } from "./light_list.js";
 import { Lights, linear } from "./lights.js";
 import { Strokes } from "./strokes.js";
@@ -26,8 +28,9 @@ window.envedit = { log, displays, advise };
 // Tools that ask the server about a place of the rendering. Those with a sentence place a light by a click.
 const PICKS = {
   move: ["highlight"], "move-shadow": ["shadow"], illuminate: ["illuminate", "illuminates this place"],
-  rim: ["rim", "lights the rim from this place on"], cast: ["cast", "casts a shadow here"],
+  rim: ["rim", "lights the rim from this place on"], cast: ["cast", "casts a shadow here"], shares: ["shares"],
 };
+const ORIENTATION = [["degrees", "rotate_degrees"], ["tilt", "tilt_degrees"], ["horizon", "horizon_degrees"]]; // numbers, and their keys
 const AMOUNTS = { light: [2, 0.6], shadow: [1, 0.6], contrast: [4, 1.6] }; // largest, and what is chosen
 const frames = { render: [], map: [], difference: [], unreachable: [], before: [], photograph: [], explanation: [] }; // the last of each view
 
@@ -163,9 +166,7 @@ const RECEIVED = {
   start(message) {
     if (opened) return;
     $("start").hidden = false;
-    list($("shipped"), message.scenes.map((name) => [name, name]));
-    list($("edits"), message.configurations.map((name) => [name, name.replace(/.*\//, "").replaceAll("_", " ")]));
-    list($("recent"), message.recent.map((one) => [one.path, `${one.title}, in ${one.path.split(/[\\/]/).slice(-3, -1).join("/")}`]));
+    chooser.offer(message);
     $("names").replaceChildren(...message.scenes.concat(message.configurations).map((name) => Object.assign(document.createElement("option"), { value: name })));
     state("ready", "Choose what to paint on");
   },
@@ -194,6 +195,7 @@ const RECEIVED = {
     say(message.again && !message.notes.length ? `Goes on from painted.toml of ${message.folder}` : message.notes.join("; "), true);
     refresh();
   },
+  thumbnail(message) { if (!opened) chooser.picture(message); },
   document(message) { history.follow({ ...EMPTY, ...message.document }, !message.client); refresh(); },
   lights(message) { lights.set(message); },
   explanations(message) { explain(message); },
@@ -270,16 +272,6 @@ function say(text, good = false) {
   $("message").classList.toggle("good", good);
 }
 
-function list(holder, entries) {
-  holder.replaceChildren(...entries.map(([name, text]) => {
-    const item = document.createElement("li"), button = document.createElement("button");
-    button.textContent = text;
-    button.addEventListener("click", () => open(name));
-    item.append(button);
-    return item;
-  }));
-}
-
 // ---- painting
 
 const strokes = new Strokes($("overlay"), () => ({
@@ -346,7 +338,10 @@ function ask(x, y) {
 RECEIVED.picked = (message) => {
   if (message.client !== client) return;
   answered = message.number;
-  if (message.text) say(`Light not moved: ${message.text}`);
+  if (message.shares) {
+    if (message.light >= 0) lights.choose(message.light);
+    say(madeBy(message.shares), true);
+  } else if (message.text) say(`Light not moved: ${message.text}`);
   else if (message.azimuth === undefined) {
     picked = message.light;
     point = message.point ?? [];
@@ -366,6 +361,15 @@ RECEIVED.picked = (message) => {
   lights.commit();
 };
 
+// Whose light a pixel shows, in words: lights that give 1 % of it or more, and the rest of the map.
+function madeBy(shares) {
+  const listed = lights.list(), percent = (share) => `${Math.round(100 * share)} %`;
+  const named = (i) => i < 0 ? "a light added by paint" : `light ${i + 1}${listed[i]?.entry.name ? ` (${listed[i].entry.name})` : ""}`;
+  const parts = shares.filter(([, share]) => share >= 0.01).sort((a, b) => b[1] - a[1]);
+  const rest = 1 - parts.reduce((sum, [, share]) => sum + share, 0);
+  return `Light of this place: ${[...parts.map(([i, share]) => `${percent(share)} by ${named(i)}`), `${percent(Math.max(0, rest))} by the rest of the map`].join(", ")}`;
+}
+
 const lights = new Lights($("map-stack"), $("handles"), {
   set: $("light"), name: $("light-name"), flux: $("light-flux"), color: $("light-color"), size: $("light-size"),
   shaped: $("light-shaped"), shape: $("light-shape"), aspect: $("light-aspect"), rotation: $("light-rotation"), softness: $("light-softness"),
@@ -378,6 +382,18 @@ const lights = new Lights($("map-stack"), $("handles"), {
   drawn: (all) => listed.draw(all),
 });
 const listed = new LightList($("light-list"), lights);
+const level = new Level($("map-stack"), $("level-line"), $("level"), {
+  document: () => history.document,
+  preview(change) {
+    lights.draft = { ...history.document, ...change };
+    history.preview(change, "dragging");
+    lights.draw();
+    level.draw(lights.draft);
+    orient(lights.draft);
+  },
+  done: (change) => history.push(change),
+});
+$("level").addEventListener("click", () => { $("level-degrees").hidden = $("level-hint").hidden = $("level-line").hidden; });
 
 // ---- controls
 
@@ -390,7 +406,7 @@ function refresh() {
     frames.unreachable = [];
     $("unreachable").parentElement.hidden = true;
   }
-  $("degrees").value = now.rotate_degrees;
+  orient(now);
   $("map-exposure").value = now.exposure;
   $("map-temperature").value = now.temperature;
   $("map-exposure-slide").value = now.exposure;
@@ -400,8 +416,13 @@ function refresh() {
   valued($("freedom"));
   lights.draft = null;
   lights.draw();
+  level.draw();
   strokes.draw();
   compare.draw();
+}
+
+function orient(document) {
+  for (const [id, key] of ORIENTATION) $(id).value = document[key];
 }
 
 function choose(name, value) {
@@ -456,7 +477,7 @@ $("size").addEventListener("input", () => strokes.draw());
 $("outlines").addEventListener("click", outline);
 $("help").addEventListener("click", () => $("keys").showModal());
 $("keys-close").addEventListener("click", () => $("keys").close());
-for (const [id, key] of [["degrees", "rotate_degrees"], ["map-exposure", "exposure"], ["map-temperature", "temperature"]]) {
+for (const [id, key] of [...ORIENTATION, ["map-exposure", "exposure"], ["map-temperature", "temperature"]]) {
   $(id).addEventListener("change", () => {
     const value = Number($(id).value);
     if (!$(id).checkValidity() || !Number.isFinite(value) || (key === "temperature" && value && value < 2000)) {
@@ -501,6 +522,7 @@ window.addEventListener("keydown", (event) => {
   } else if (key === "b" && !event.repeat) displays.render.set({ split: 1 });
   else if (key === "o" && !event.repeat) outline();
   else if (key === "m") compare.large();
+  else if (key === "l") $("level").click();
   else if (key === "a") compare.keep();
   else if (key === "h") compare.toggle();
   else if (key === "+" || key === "-") zooms[0].by(key === "+" ? 1.2 : 1 / 1.2);
@@ -524,6 +546,7 @@ window.addEventListener("resize", () => { for (const one of Object.values(displa
 
 // ---- start page
 
+const chooser = new Chooser($("open-map"), open);
 function open(name, envmap = $("open-map").value.trim()) {
   say("");
   state("loading", `Opening ${name}`);
@@ -536,7 +559,7 @@ async function upload(file) {
   const answer = await fetch(`map/${encodeURIComponent(file.name)}`, { method: "PUT", body: file });
   const text = await answer.text();
   if (!answer.ok) { say(text); state("ready", "Choose what to paint on"); return; }
-  $("open-map").value = text;
+  chooser.choose(text);
   $("open-name").value ||= "sphere";
   state("ready", "Choose what to paint on");
 }

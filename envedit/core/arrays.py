@@ -1,4 +1,7 @@
-"""Numpy arrays to Dr.Jit's, as inputs of kernels: never as literals, each of which is a kernel of its own."""
+"""Numpy arrays to Dr.Jit's, as inputs of kernels: never as literals, each of which is a kernel of its own.
+
+Always copied, for numpy's own memory is aligned now and then only, and either makes another kernel.
+"""
 
 from __future__ import annotations
 

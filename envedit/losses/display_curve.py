@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from envedit.core.arrays import tensor
 from envedit.core.types import ArrayLike
 
 LOW = 1e-3
@@ -30,7 +31,7 @@ def shown(x: mi.Float) -> mi.Float:
 
 def slope(radiance: ArrayLike) -> np.ndarray:
     """Return the derivative of :func:`to_display` at linear radiance (h, w, 3)."""
-    x = mi.TensorXf(np.ascontiguousarray(radiance, np.float32))
+    x = tensor(radiance)
     with dr.isolate_grad():
         dr.enable_grad(x)
         dr.backward(dr.sum(to_display(x).array))

@@ -18,6 +18,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from envedit.core.arrays import flat
+
 # 2^32 divided by the plastic number and by its square: integer overflow takes the fractional part.
 _R2 = (0xC13FA9A9, 0x91E10DA5)
 _TO_UNIT = 2.0**-32
@@ -145,7 +147,7 @@ def trace(
 def rays_through(scene: mi.Scene, view: int, places: np.ndarray) -> mi.Ray3f:
     """Return the camera's rays through places (n, 2) of a view, as shares of its width and height."""
     sensor = scene.sensors()[view]
-    place = mi.Point2f(*(mi.Float(np.float32(share)) for share in places.T))
+    place = mi.Point2f(*(flat(mi.Float, np.float32(share)) for share in places.T))
     return mi.Ray3f(sensor.sample_ray(mi.Float(sensor.shutter_open()), 0.5, place, mi.Point2f(0.5))[0])
 
 
@@ -228,7 +230,7 @@ def _filter_offset(rfilter, u, index, size, border):
         return u, mi.Float(1)
     knots = np.linspace(-radius, radius, 4097)
     centres = (knots[:-1] + knots[1:]) / 2
-    values = np.array(rfilter.eval(mi.Float(np.abs(centres).astype(np.float32)))).astype(np.float64)
+    values = np.array(rfilter.eval(flat(mi.Float, np.abs(centres).astype(np.float32)))).astype(np.float64)
     cumulative = np.concatenate([[0], np.cumsum(np.abs(values))])
     signed = np.concatenate([[0], np.cumsum(values)])
     table, signed_table = (dr.opaque(mi.Float(t / cumulative[-1])) for t in (cumulative, signed))

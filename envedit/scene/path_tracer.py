@@ -13,9 +13,9 @@ import math
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from envedit.core import installed_plugins, latlong
+from envedit.core.arrays import tensor
 from envedit.core.errors import ConfigError
 from envedit.scene import film
 from envedit.scene.scene import Scene
@@ -88,7 +88,7 @@ class PathTracer:
         """Render the map as Mitsuba holds it, (H, W + 2, 3), without derivatives."""
         self._set(data)
         rendering = film.render(self.scene.mi, self._integrators[0], self.spp, seed)[..., :3]
-        return mi.TensorXf(rendering.astype(np.float32))
+        return tensor(rendering)
 
     def gradient(self, data: mi.TensorXf, seed: int, picture: mi.TensorXf) -> mi.TensorXf:
         """Pull a picture back to the map as Mitsuba holds it: the adjoint of rendering."""

@@ -76,7 +76,7 @@ class Objective:
             for name, value in asdict(weights).items()
             if value and (name != "dists" or dists)
         }
-        self._target = dr.opaque(to_display(mi.TensorXf(np.ascontiguousarray(picture, np.float32))))
+        self._target = dr.opaque(to_display(tensor(picture)))
         self._weight = None if pixel_weight is None else tensor(pixel_weight)
         self._original = tensor(original)
         shown = self._target, self._weight

@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from envedit.core import latlong
-from envedit.core.arrays import tensor
+from envedit.core.arrays import flat, tensor
 from envedit.core.color import LUMINANCE
 from envedit.representations.layers.layers import Layers
 from envedit.transport.light_transport import LightTransport
@@ -99,7 +99,7 @@ class BlockJacobian:
 
     def of_cells(self, flux: np.ndarray) -> list[mi.TensorXf]:
         """Return pictures in blocks of a flux (3,) in each cell of :attr:`sky`, (blocks, n) per channel."""
-        return [m * mi.Float(np.float32(f)) for m, f in zip(self._lit, flux, strict=True)]
+        return [m * flat(mi.Float, np.float32(f)) for m, f in zip(self._lit, flux, strict=True)]
 
     def products(self, pictures: list[np.ndarray]) -> list[np.ndarray]:
         """Return, per channel, products of pictures (blocks, k) with those of :attr:`sky`'s cells: (k, n).

@@ -7,9 +7,9 @@ Both noises are measured, that of T by a second recording, and such pixels are d
 
 from __future__ import annotations
 
-import mitsuba as mi
 import numpy as np
 
+from envedit.core.arrays import tensor
 from envedit.core.types import Views
 from envedit.losses.display_curve import to_display
 
@@ -57,7 +57,7 @@ def weights(
         :data:`LIGHT_BRIGHTNESS`; medians are over pixels that are :data:`LEAST_BRIGHTNESS`. None where no
         pixel is below 1/2, or none that is lit is above 0.
     """
-    shown = [to_display(mi.TensorXf(np.ascontiguousarray(p, np.float32))).numpy() for p in (first, second)]
+    shown = [to_display(tensor(p)).numpy() for p in (first, second)]
     variance = np.square(shown[0].astype(np.float64) - shown[1]).mean(axis=2) * share / (1 + share)
     if noise is not None:
         variance += np.square(noise)

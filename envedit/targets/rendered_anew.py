@@ -11,9 +11,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import mitsuba as mi
 import numpy as np
 
+from envedit.core.arrays import tensor
 from envedit.core.types import Views
 from envedit.losses.display_curve import to_display
 
@@ -76,7 +76,7 @@ def samples(
 
 def high_pass(picture: np.ndarray, views: Views = (slice(None),)) -> np.ndarray:
     """Return display values (h, w, 3) without what is smooth in them, view by view."""
-    shown = to_display(mi.TensorXf(np.ascontiguousarray(picture, np.float32))).numpy().astype(np.float64)
+    shown = to_display(tensor(picture)).numpy().astype(np.float64)
     parts = []
     for rows in views:
         padded = np.pad(shown[rows], ((1, 1), (1, 1), (0, 0)), mode="edge")

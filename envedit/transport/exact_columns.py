@@ -229,8 +229,10 @@ class ExactColumns:
         _, target, value = merge(np.zeros(len(target), np.uint32), target, value, len(self._store) // 4)
         place = path_vertices.on_device(mi.UInt32, target) * 4
         real = dr.arange(mi.UInt32, len(place)) < dr.opaque(mi.UInt32, len(target))
+        mode = dr.ReduceMode.NoConflicts  # merged: each place once; the default's kernel has sizes in it
         for c in range(3):
-            dr.scatter_add(self._store, path_vertices.on_device(mi.Float, value[:, c]), place + c, real)
+            channel = path_vertices.on_device(mi.Float, value[:, c])
+            dr.scatter_add(self._store, channel, place + c, real, mode)
         dr.eval(self._store)
 
     # ---- using ---------------------------------------------------------------------------------------------

@@ -132,7 +132,7 @@ def _sort(block, parts):
 def _counted(pixel, count):
     """Count how often each of so many numbers occurs, on the host."""
     counts = dr.zeros(mi.UInt32, max(count, 2))
-    # Not in copies for every thread, the default: such a kernel has the size in it.
+    # Not in copies for every thread, the default: such a kernel has sizes and threads in it.
     dr.scatter_add(counts, mi.UInt32(1), pixel, mode=dr.ReduceMode.Local)
     return counts.numpy()[:count].astype(np.int64)
 
@@ -306,7 +306,7 @@ def _connect(scene, grid, block, texels, each, count, values, lost):
         value = connect(scene, vertex, direction, jacobian, uniform / jacobian)
         value = value * (dr.gather(mi.Float, each[2], t) * jacobian / per_pixel)
         finite = dr.all(dr.isfinite(value))
-        dr.scatter_add(lost, mi.UInt32(1), mi.UInt32(0), ~finite)
+        dr.scatter_add(lost, mi.UInt32(1), mi.UInt32(0), ~finite, mode=dr.ReduceMode.Local)
         value = dr.select(finite, value, 0)
         dr.scatter(values[0], value.x, t * vertices + v)
         dr.scatter(values[1], value.y, t * vertices + v)

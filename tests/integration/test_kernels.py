@@ -74,15 +74,14 @@ def test_no_kernel_is_compiled_after_the_third_gauss_newton_step(monkeypatch):
 
     monkeypatch.setattr(map_problem.Problem, "normal", counted)
     monkeypatch.setattr(gauss_newton, "LEAST_DECREASE", 1e-9)  # some steps more
-    # What is between steps has kernels of its own.
+    # What is between solves, the search and T's error, has kernels of its own.
+    monkeypatch.setattr(layers_solver.LayersSolver, "_another", lambda *_: None)
     monkeypatch.setattr(layers_solver.LayersSolver, "_corrected", lambda *_: None)
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
         result = pipeline.run(settings)
     assert len(fresh) > 5 and len(result.history) > 2 and min(launched) > 5
-    # The kernel that moves the store of columns where that has to grow is compiled when it does first.
-    late = [step for step, count in enumerate(fresh) if step >= 3 and count]
-    assert sum(fresh[3:]) <= 1 and all(columns[step] > columns[step - 1] for step in late), (fresh, columns)
+    assert fresh[3:] == [0] * len(fresh[3:])
     assert columns[-1] > columns[3]
 
 

@@ -73,7 +73,7 @@ def coordinates(height: int, width: int) -> mi.TensorXf:
     y = (2 * np.arange(height) + 1) / height - 1
     x = (2 * np.arange(width) + 1) / width - 1
     grid = np.stack(np.meshgrid(y, x, indexing="ij"), axis=-1).reshape(-1, 2)
-    return mi.TensorXf(grid.astype(np.float32))
+    return tensor(grid)
 
 
 def directions(height: int, width: int, first: int = 0, total: int | None = None) -> mi.TensorXf:
@@ -83,7 +83,7 @@ def directions(height: int, width: int, first: int = 0, total: int | None = None
     The rows are ``first`` ... ``first + height - 1`` of a map of ``total`` rows; all of them by default.
     """
     d = latlong.directions(total or height, width)[first : first + height]
-    return mi.TensorXf((SPHERE_SCALE * d).astype(np.float32).reshape(-1, 3))
+    return tensor((SPHERE_SCALE * d).reshape(-1, 3))
 
 
 def forward(params: Params, x: mi.TensorXf, omega: float) -> tuple[mi.TensorXf, list]:

@@ -76,7 +76,7 @@ class Input(Table):
         (), LightList(), "lights moved, changed or added by hand, before the map is rotated and edited"
     )
     regions: tuple[dict, ...] = key(
-        (), RegionList(), "regions of the map that are kept, scaled or filled, after lights and before turn"
+        (), RegionList(), "regions of the map that are kept, scaled or filled, after lights and before the rotation"
     )
     colour_space: str = key(
         "auto",

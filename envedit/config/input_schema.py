@@ -76,7 +76,9 @@ class Input(Table):
         (), LightList(), "lights moved, changed or added by hand, before the map is rotated and edited"
     )
     regions: tuple[dict, ...] = key(
-        (), RegionList(), "regions of the map that are kept, scaled or filled, after lights and before the rotation"
+        (),
+        RegionList(),
+        "regions of the map that are kept, scaled or filled, after lights and before the rotation",
     )
     colour_space: str = key(
         "auto",

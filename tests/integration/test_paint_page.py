@@ -521,7 +521,7 @@ def regions_are_painted(page, kept, session):
     until(lambda: [one["action"] for one in regions()] == ["scale"])
 
 
-def test_a_map_is_chosen_and_levelled_its_regions_painted_and_its_lights_ordered(browser, tmp_path, monkeypatch):
+def test_a_map_is_chosen_levelled_and_painted_and_lights_are_ordered(browser, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "edit.toml").write_text(SMALL)
     images.write_exr("sky.exr", analytic_sky.sunsky(64, 200, 30, 3), {})

@@ -10,6 +10,7 @@ from envedit.core import latlong
 from envedit.core.errors import ConfigError, MachineError
 from envedit.export import file_resolution
 from envedit.images import images, map_regions
+from envedit.representations.layers.oriented import oriented, oriented_share
 from tests.oracles.devices import on_cpu
 
 SHAPE = 64, 128
@@ -118,8 +119,8 @@ def test_without_opencv_the_extra_is_named(monkeypatch):
 
 @on_cpu
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["layers", "pixels"])
-def test_what_is_kept_has_the_bits_of_the_input_at_both_resolutions(tmp_path, kind):
+@pytest.mark.parametrize(("kind", "tilt"), [("layers", 20), ("pixels", 0)])
+def test_what_is_kept_has_the_bits_of_the_input_at_both_resolutions(tmp_path, kind, tilt):
     """Under a target that asks for half the light, all but the region with the sun gets darker."""
     wide = inputs.read_map(config.Input(envmap="sunsky", width=128), None, 128).radiance
     images.write_exr(tmp_path / "sky.exr", wide, {})
@@ -128,6 +129,7 @@ def test_what_is_kept_has_the_bits_of_the_input_at_both_resolutions(tmp_path, ki
     envmap = "sky.exr"
     width = 64
     rotate_degrees = 90
+    tilt_degrees = {tilt}
     [[input.regions]]
     action = "keep"
     points = [[90, 35]]
@@ -158,11 +160,12 @@ def test_what_is_kept_has_the_bits_of_the_input_at_both_resolutions(tmp_path, ki
     settings = config.loads(text, tmp_path)
     result = pipeline.run(settings)
     full = file_resolution.at_full_resolution(settings, result)
-    regions = settings.input.regions
-    given = latlong.rotate(map_regions.changed(wide, regions), 90)
+    regions, orientation = settings.input.regions, settings.input.orientation
+    given = oriented(map_regions.changed(wide, regions), orientation)
     for edited, before in ((result.envmap, result.maps["initial"]), (full, given)):
-        kept = latlong.rotate(map_regions.kept(regions, *edited.shape[:2]), 90)
-        assert np.array_equal(edited[kept == 1], before[kept == 1])
+        kept = oriented_share(map_regions.kept(regions, *edited.shape[:2]), orientation)
+        assert (kept == 1).sum() > 20 and np.array_equal(edited[kept == 1], before[kept == 1])
         assert edited[kept == 0].mean() < 0.98 * before[kept == 0].mean(), "what is free does not follow"
-    brighter = latlong.rotate(map_regions.kept([{**regions[1], "action": "keep"}], 64, 128), 90) == 1
-    assert np.allclose(given[brighter], 2 * latlong.rotate(wide, 90)[brighter])
+    brighter = oriented_share(map_regions.kept([{**regions[1], "action": "keep"}], 64, 128), orientation) == 1
+    twice = 2 * oriented(wide, orientation)[brighter]
+    assert np.allclose(given[brighter], twice, rtol=0 if tilt == 0 else 0.02)

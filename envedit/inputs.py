@@ -15,9 +15,9 @@ from envedit.core.errors import ConfigError, InputError, NumericalError
 from envedit.core.primaries import Chromaticities
 from envedit.core.radiance import BRIGHTEST, require_radiance
 from envedit.core.rows import Rows
-from envedit.images import analytic_sky, images
+from envedit.images import analytic_sky, images, map_regions
 from envedit.representations.layers import unclip
-from envedit.representations.layers.oriented import oriented
+from envedit.representations.layers.oriented import oriented, oriented_share
 from envedit.representations.layers.placed_lights import PlacedLights, missing
 from envedit.scene import scene as scenes
 from envedit.scene import supported
@@ -63,6 +63,8 @@ class InputMap:
     unmoved: np.ndarray | None = None
     # (H, W, 3), what of :attr:`radiance` is of lights that ``[[input.lights]]`` locks
     locked: np.ndarray | None = None
+    # (H, W), how far ``[[input.regions]]`` keep a texel of :attr:`radiance`, 0 to 1; None: nowhere
+    kept: np.ndarray | None = None
     half: bool = False  # whether the file is OpenEXR in half
     unclipped: str = ""  # what was done about a clipped sun, a clause; "" where that was not asked for
 
@@ -204,31 +206,34 @@ def read_map(
 
 
 def _by_hand(settings, input_map):
-    """Return a map with its lights placed as ``lights`` ask, then rotated as a whole."""
-    if not settings.lights and not any(settings.orientation):
+    """Return a map as ``lights``, ``regions`` and its orientation ask, in this order."""
+    if not settings.lights and not settings.regions and not any(settings.orientation):
         return input_map
-    stored = input_map.stored
     placed = locked = None
+    radiance = input_map.radiance
     warnings = [*input_map.warnings]
-    if settings.lights:
-        placed = PlacedLights(input_map.radiance, settings.horizon)
-        stored = input_map.as_stored(placed.place(settings.lights))
-        locked = placed.locked(settings.lights)
+    kept = map_regions.kept(settings.regions, *radiance.shape[:2])
+    if settings.lights or kept is not None:
+        placed = PlacedLights(radiance, settings.horizon)
+        lights = placed.locking(settings.lights, kept)
+        radiance = placed.place(lights)
+        locked = placed.locked(lights, settings.regions)
         locked = None if locked is None else oriented(locked, settings.orientation)
         if lacking := missing(settings.lights, len(placed.lights)):
             count = len(placed.lights)
-            lights = f"the map has {count} light{'s' if count != 1 else ''}"
+            known = f"the map has {count} light{'s' if count != 1 else ''}"
             entries = "entry is" if len(lacking) == 1 else "entries are"
             numbers = ", ".join(map(str, lacking))
-            warnings.append(f"input.lights: got light = {numbers}, but {lights}; the {entries} ignored")
-    rotated = oriented(stored, settings.orientation)
+            warnings.append(f"input.lights: got light = {numbers}, but {known}; the {entries} ignored")
+    radiance = map_regions.changed(radiance, settings.regions)
     return replace(
         input_map,
-        stored=rotated,
+        stored=oriented(input_map.as_stored(radiance), settings.orientation),
         warnings=warnings,
         placed=placed,
         unmoved=input_map.radiance,
         locked=locked,
+        kept=None if kept is None else oriented_share(kept, settings.orientation),
     )
 
 

@@ -261,6 +261,7 @@ class _Edit:
             self.dists,
             self.clock,
             self.map.locked,
+            self.map.kept,
         )
         preparation.trace()
         return preparation
@@ -289,9 +290,9 @@ class _Edit:
         """Set the factor by which a map of a photograph keeps the mean log irradiance of six planes.
 
         One picture does not separate the map's level from exposure, and this differs least between skies.
-        Beside other lamps, and where rows keep their radiance, the level is determined.
+        Beside other lamps, and where rows or regions keep their radiance, the level is determined.
         """
-        if self.scene.own.added or not self.rows.all:
+        if self.scene.own.added or not self.rows.all or self.map.kept is not None:
             return
         before, after = (
             luminance(map_lights.irradiance(sky, np.array(list(map_lights.AXES.values()))))
@@ -348,6 +349,7 @@ class _Edit:
                 painted=target.coverage[..., 0],
                 rendered=target.initial,
                 known=self.solved_map,
+                kept=self.map.kept,
             )
             picture = at_size(feasible.picture, self.small, self.scene)
             residual = at_size(feasible.residual, self.small, self.scene)

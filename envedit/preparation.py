@@ -20,6 +20,7 @@ from envedit.core.errors import NumericalError
 from envedit.core.resampling import fit as fitted
 from envedit.core.rows import Rows
 from envedit.core.seeds import Seeds
+from envedit.images import map_regions
 from envedit.losses.perceptual import distances
 from envedit.representations.layers import below_horizon
 from envedit.representations.siren import fit
@@ -71,6 +72,7 @@ class Preparation:
     clock: Callable[[str], AbstractContextManager]  # ``with clock(name):`` adds up seconds
     # (H, W, 3), radiance of lights that layers leave as they are; the sky is then not turned
     locked: np.ndarray | None = None
+    kept: np.ndarray | None = None  # (H, W), how far texels stay as they are; the sky is then not turned
     renderer: renderers.Renderer | None = None
     _recordings: initialization.Recordings | None = None
 
@@ -143,7 +145,9 @@ class Preparation:
     def _turn(self, target):
         """Return the turn that explains the target best; None where the sky is not to turn."""
         chosen, transport = self.settings.representation.turn, self.renderer.transport
-        if chosen is False or transport is None or not self.rows.all or self.locked is not None:
+        if chosen is False or transport is None or not self.rows.all:
+            return None
+        if self.locked is not None or self.kept is not None:
             return None
         if chosen == "auto" and target.coverage is not None:  # most of a painted picture is to stay
             return None
@@ -232,6 +236,9 @@ class Preparation:
             if octaves or not job.newton:
                 frozen[rows] = ~traced.determined(rows, settings.renderer.influence_threshold)[rows]
             job.free = ~frozen[rows] if frozen.any() else None
+        if self.kept is not None and kind != "layers":  # which know it themselves
+            open_texels = self.kept[rows] < map_regions.KEPT_SHARE
+            job.free = open_texels if job.free is None else job.free & open_texels
         if recordings:
             representation = representation.keeping(job.free)
             job.representation = representation
@@ -266,6 +273,7 @@ class Preparation:
             self.rows.place,
             horizon,
             None if self.locked is None else self.locked[self.rows.slice],
+            None if self.kept is None else self.kept[self.rows.slice],
         )
 
     def _explained(self, job, params, octaves, notes, transport):

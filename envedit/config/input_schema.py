@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from envedit.config.key_validators import MOST_DIM, Parameters, RowRange, View, ViewList
 from envedit.config.light_schema import LightList
+from envedit.config.region_schema import RegionList
 from envedit.config.stroke_schema import StrokeList
 from envedit.config.tables import EDITED, LAYERS, Table, key
 from envedit.config.validators import Boolean, Choice, Integer, Number, OneOrMore, OrAuto, String, show
@@ -73,6 +74,11 @@ class Input(Table):
     )
     lights: tuple[dict, ...] = key(
         (), LightList(), "lights moved, changed or added by hand, before the map is rotated and edited"
+    )
+    regions: tuple[dict, ...] = key(
+        (),
+        RegionList(),
+        "regions of the map that are kept, scaled or filled, after lights and before the rotation",
     )
     colour_space: str = key(
         "auto",

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from envedit.config import light_schema, stroke_schema
+from envedit.config import light_schema, region_schema, stroke_schema
 from envedit.config.presets import MANY_PARAMETERS, PAINTED, PRESETS, SIREN
 from envedit.config.schema import FIELDS, TOP, Config
 from envedit.config.toml import quote
@@ -53,7 +53,7 @@ def markdown() -> str:
             about += f" {only[0].upper()}{only[1:]}."
         parts.append(_keys(f"[{name}]", name, keys, made, about))
         if name == "input":
-            parts.append(_lights())
+            parts += [_lights(), _regions()]
         if name == "target":
             parts.append(_strokes())
     return "\n".join([*parts, _kinds()])
@@ -90,6 +90,13 @@ def _lights() -> str:
         "A light of the map (with `light`), or one that is added; see [by hand](painting_in_the_browser.md)."
     )
     return f"### [[input.lights]]\n\n{about} {default}\n\n{_table(['key', 'values', 'meaning'], rows)}"
+
+
+def _regions() -> str:
+    keys = region_schema.KEYS
+    rows = [[f"`{key}`", _values(keys[key]), about] for key, about in region_schema.MEANINGS.items()]
+    about = "A region has one shape: points or polygon; see [regions of the map](regions.md)."
+    return f"### [[input.regions]]\n\n{about}\n\n{_table(['key', 'values', 'meaning'], rows)}"
 
 
 def _strokes() -> str:

@@ -11,9 +11,10 @@ from envedit import config, inputs
 from envedit.core import latlong
 from envedit.core.rows import Rows
 from envedit.export import adjustments, full_resolution
+from envedit.images import map_regions
 from envedit.representations import Layers, Representation
 from envedit.representations.layers import placed_lights
-from envedit.representations.layers.oriented import oriented
+from envedit.representations.layers.oriented import oriented, oriented_share
 
 if TYPE_CHECKING:
     from envedit import results
@@ -63,16 +64,20 @@ def carried(
 ) -> tuple[inputs.InputMap, np.ndarray]:
     """Carry an edit to the map as its file has it.
 
-    ``settings`` have the lights that were placed by hand; ``input_map`` is the map at working size, ``own``
-    as the file has it, and ``initial`` (h, w, 3) the working map that was edited. Returns the map with its
-    lights placed, and its edit (H, W, 3), radiance before adjustments.
+    ``settings`` have the lights that were placed by hand, and the regions; ``input_map`` is the map at
+    working size, ``own`` as the file has it, and ``initial`` (h, w, 3) the working map that was edited.
+    Returns the map with its lights placed and its regions changed, and its edit (H, W, 3), radiance before
+    adjustments.
     """
+    settings = _kept_lights_locked(settings, input_map)
     full = _by_hand(settings, input_map, own)
     before = latlong.rotate(initial, solution.turn_degrees)
     source = latlong.rotate(full.radiance, solution.turn_degrees)
     rows = inputs.active_rows(settings.rows, before.shape[0])
 
-    # ---- Locked lights, which stay as they are
+    # ---- Locked lights and regions, which stay as they are
+    kept = map_regions.kept(settings.regions, *source.shape[:2])
+    original = source
     locked = None
     others = placed_lights.without_locked(settings.lights)
     if others is not None and isinstance(solution.representation, Layers):
@@ -85,11 +90,24 @@ def carried(
         solution.representation, solution.params, before, solution.edited, source, rows, solution.free
     )
     edited = edited if locked is None else edited + locked
-    return full, edited if solution.level == 1 else edited * np.float32(solution.level)
+    edited = edited if solution.level == 1 else edited * np.float32(solution.level)
+    if kept is not None:
+        kept = latlong.rotate(oriented_share(kept, settings.orientation), solution.turn_degrees)
+        edited = map_regions.blended(edited, original, kept)
+    return full, edited
+
+
+def _kept_lights_locked(settings, input_map):
+    """Lock the lights that stand in regions that are kept."""
+    if input_map.placed is None:
+        return settings
+    placed = input_map.placed
+    kept = map_regions.kept(settings.regions, *placed.envmap.shape[:2])
+    return replace(settings, lights=placed.locking(settings.lights, kept))
 
 
 def _by_hand(settings: config.Input, input_map: inputs.InputMap, own: inputs.InputMap) -> inputs.InputMap:
-    """Place the lights of the map, and rotate it, as the file has it as it was done at working size."""
+    """Place lights, change regions, and rotate the map as the file has it, as at working size."""
     full = own
     if input_map.placed is not None:
         placed = input_map.placed
@@ -102,4 +120,7 @@ def _by_hand(settings: config.Input, input_map: inputs.InputMap, own: inputs.Inp
             )
         moved = placed_lights.add(moved, [light for light in settings.lights if "light" not in light])
         full = replace(full, stored=full.as_stored(moved))
+    if settings.regions:
+        changed = map_regions.changed(full.radiance, settings.regions)
+        full = replace(full, stored=full.as_stored(changed))
     return replace(full, stored=oriented(full.stored, settings.orientation))

@@ -53,10 +53,12 @@ def encoded(
     rows: tuple[int, int] | None = None,
     horizon: Horizon = "free",
     fixed: np.ndarray | None = None,
+    kept: np.ndarray | None = None,
 ) -> tuple[Representation, Params]:
     """Return an image (rows, W, 3) in the representation that a configuration asks for, and its parameters.
 
-    ``horizon`` and ``fixed`` are of layers alone (:meth:`.Layers.of`); the others are as for :func:`make`.
+    ``horizon``, ``fixed`` and ``kept`` are of layers alone (:meth:`.Layers.of`); the others are as for
+    :func:`make`.
     """
     if settings.representation.kind != "layers":
         fitted = make(settings, folder, progress, rows)
@@ -65,5 +67,5 @@ def encoded(
     # Towards a rendering an added light may be a haze, or stand where the map has a sun with a glow.
     painted = settings.target.kind in ("image", "strokes")
     cycles = CYCLES if isinstance(cycles, str) else cycles
-    layers = Layers.of(image, rows, cycles, horizon, aureoles=painted, fixed=fixed)
+    layers = Layers.of(image, rows, cycles, horizon, aureoles=painted, fixed=fixed, kept=kept)
     return layers, layers.start()

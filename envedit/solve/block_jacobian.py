@@ -32,6 +32,7 @@ class BlockJacobian:
         self._present = ordered[self._starts]
         self._total = np.bincount(overview.cell_of, omega, cells)
         self._cell, self._omega, self._cells = overview.cell_of[active], omega[active], cells
+        self._changeable = (self._omega.reshape(*self._shape, 1) * layers.changeable).ravel()
         # Hats are weighed by the sky's luminance: what is bright in a cell determines its gain.
         sky = np.maximum(layers.background().reshape(-1, 3) @ LUMINANCE, 1e-12) * self._omega
         light = np.maximum(np.bincount(self._cell, sky, cells), 1e-30)
@@ -83,9 +84,9 @@ class BlockJacobian:
 
     @functools.cached_property
     def sky(self) -> tuple[np.ndarray, np.ndarray]:
-        """Cells that lie in rows of the sky: their numbers in use, and directions (n, 3)."""
+        """Cells of the sky that may change: their numbers in use, and directions (n, 3)."""
         own = self._cell[: self._own]
-        inside = np.bincount(own, self._omega[: len(own)], self._cells)
+        inside = np.bincount(own, self._changeable[: len(own)], self._cells)
         cells = np.flatnonzero(inside[self._used] > 0.5 * self._total[self._used])
         return cells, self._directions[self._used[cells]]
 

@@ -61,7 +61,7 @@ class Derivatives:
 
     def _slopes(self, point):
         """Return the derivative of the sky by the log gain of a texel, (rows * W, 3)."""
-        slopes = point.sky.astype(np.float64)
+        slopes = point.sky * np.float64(self.layers.changeable)
         slopes[: self.layers.shape[0]] = self.layers.gain_slope(self.unknowns.params(point.state))
         return slopes.reshape(-1, 3)
 
@@ -97,6 +97,7 @@ class Derivatives:
             placements.append((turn, flux, size + SIZE_STEP))
             core, *ends, larger = layers.lights.cores_of(i, placements, layers.whole)
             cores = np.stack([core, *self._differences(ends), (larger - core) / SIZE_STEP])
+            cores *= layers.changeable
             pictures = self.transport.pictures(cores, self.rows, most).reshape(4, -1, 3)
             lights.append((i, turns, cores, pictures))
             names += [*(("turn", i, axis) for axis in axes), ("size", i, 0)]
@@ -104,6 +105,7 @@ class Derivatives:
 
         # ---- Glows, and the ground that lights shine on, through the blocks
         profile = self._profile(point, [pictures[0] for *_, pictures in lights])
+        sky = sky * layers.changeable
         for i, turns, cores, pictures in lights:
             log_glow, *ends = (self._log_glow(state, i, one) for one in turns)
             change = None

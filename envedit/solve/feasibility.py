@@ -31,6 +31,7 @@ from envedit.core.arrays import tensor
 from envedit.core.color import tonemap
 from envedit.core.rows import Rows
 from envedit.core.seeds import SIGNS
+from envedit.images import map_regions
 from envedit.solve.likelihood import STATEMENTS, Likelihood, on_average_one
 from envedit.transport.block_transport import CELLS, tiles
 from envedit.transport.light_transport import LightTransport
@@ -111,6 +112,7 @@ def reachable(
     painted: np.ndarray | None = None,
     rendered: np.ndarray | None = None,
     known: np.ndarray | None = None,
+    kept: np.ndarray | None = None,
 ) -> Reach:
     """Find the closest picture that any non-negative map makes.
 
@@ -132,6 +134,8 @@ def reachable(
         The rendering that was painted on. Its difference from T E is noise, and is no part of the request.
     known : ndarray (H, W, 3), optional
         A map that answers the request already, such as an edit's: the closest picture is no farther than its.
+    kept : ndarray (H, W), optional
+        How far texels stay as they are; the light of those that mostly do stays.
 
     Returns
     -------
@@ -146,6 +150,8 @@ def reachable(
     original = np.ascontiguousarray(original, np.float32)
     active = np.zeros(original.shape[:2], bool)
     active[slice(None) if rows is None else rows.slice] = True
+    if kept is not None:
+        active &= kept < map_regions.KEPT_SHARE
     request = _Request.of(transport, original, target, likelihood, painted, rendered)
     distance = request.distance(request.initial)
     if distance < 1e-6:  # float32

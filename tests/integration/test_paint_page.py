@@ -477,7 +477,51 @@ def lights_are_ordered(page, kept):
     sync_api.expect(get("list-choose-1")).to_be_focused()
 
 
-def test_a_map_is_chosen_and_levelled_and_its_lights_are_ordered(browser, tmp_path, monkeypatch):
+def regions_are_painted(page, kept, session):
+    """A brush on the rotated map, its settings, keys, and a region that is taken away."""
+    get = page.page.get_by_test_id
+
+    def regions():
+        return config.load(kept).input.regions
+
+    page.page.keyboard.press("g")
+    dragged = page.at("#handles", 0.3, 0.3), page.at("#handles", 0.4, 0.3)
+    page.drag(*dragged)
+    until(lambda: len(regions()) == 1)
+    region = regions()[0]
+    assert region["action"] == "keep" and region["radius"] == 12 and region["softness"] == 6
+    orientation = Orientation(0, 12, 5)
+    start = angles(orientation.matrix @ direction(*region["points"][0]))
+    assert start == pytest.approx((108, 36), abs=0.5), "the brush is not where the pointer was"
+    until(lambda: session.kept is not None and session.kept.max() == 1)
+    get("region-action").select_option("scale")
+    get("region-stops").fill("-2")
+    get("region-stops").press("Enter")
+    until(lambda: regions()[0].get("factor") == [0.25] * 3 and session.kept is None)
+    get("region-1").click()  # none is chosen: what comes next is another one
+    get("region-action").select_option("keep")
+    get("region-radius").fill("0")
+    get("region-radius").press("Enter")
+    get("region-radius").fill("5")
+    get("regions").press("ArrowLeft")
+    get("regions").press("Space")
+    get("regions").press("Shift+ArrowLeft")
+    get("regions").press("Space")
+    until(lambda: [one["action"] for one in regions()] == ["scale", "keep"])
+    assert len(regions()[1]["points"]) == 2 and regions()[1]["radius"] == 5
+    page.shot("regions")
+    assert not page.page.evaluate(UNNAMED)
+    assert not page.page.evaluate(FAINT)
+    get("region-remove").click()
+    until(lambda: len(regions()) == 1)
+    page.page.keyboard.press("g")
+    sync_api.expect(get("region-panel")).to_be_hidden()
+    get("undo").click()
+    get("undo").click()
+    until(lambda: [one["action"] for one in regions()] == ["scale"])
+
+
+def test_a_map_is_chosen_levelled_and_painted_and_lights_are_ordered(browser, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "edit.toml").write_text(SMALL)
     images.write_exr("sky.exr", analytic_sky.sunsky(64, 200, 30, 3), {})
@@ -500,6 +544,7 @@ def test_a_map_is_chosen_and_levelled_and_its_lights_are_ordered(browser, tmp_pa
         page.page.wait_for_function("() => envedit.log.some((e) => e.frame)")
         map_is_levelled(page, kept, server.worker.session)
         assert config.load(kept).input.envmap == str(tmp_path / "sky.exr")
+        regions_are_painted(page, kept, server.worker.session)
         lights_are_ordered(page, kept)
         assert not page.faults, page.faults
 

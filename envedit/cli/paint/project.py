@@ -19,6 +19,8 @@ NAME, SOLUTION = "painted.toml", "painted.npz"
 """Files of a painting: what was painted, and the solution that was saved last."""
 MATCHED = "matched.exr"
 """The map that explains a photograph, in the folder of the run that has found it."""
+LISTS = ("lights", "regions", "strokes")
+"""What a document lists, each entry a table of its own in ``painted.toml``."""
 _RECENT = 12
 
 
@@ -88,10 +90,11 @@ class Project:
             f"variant = {config.quote(settings.variant)}",
         ]
         for name, table in given.items():
-            plain = {key: value for key, value in table.items() if key not in ("strokes", "lights")}
+            plain = {key: value for key, value in table.items() if key not in LISTS}
             if plain:
                 lines += ["", f"[{name}]", *(f"{key} = {config.quote(v)}" for key, v in plain.items())]
-        for name, entries in (("input.lights", document.lights), ("target.strokes", document.strokes)):
+        of_input = [(f"input.{name}", getattr(document, name)) for name in ("lights", "regions")]
+        for name, entries in [*of_input, ("target.strokes", document.strokes)]:
             for entry in entries:
                 lines += ["", f"[[{name}]]", *(f"{key} = {config.quote(v)}" for key, v in entry.items())]
         return "\n".join(lines) + "\n"
@@ -176,6 +179,7 @@ def opened(name: str, envmap: str = "", preset: str | None = None, camera: str =
     document = Document(
         strokes=settings.target.strokes if settings.target.kind == "strokes" else (),
         lights=settings.input.lights,
+        regions=settings.input.regions,
         **{name: getattr(settings.input, name) for name in ORIENTATION},
         exposure=settings.output.exposure,
         temperature=settings.output.temperature,
@@ -216,7 +220,7 @@ def _plain(settings, folder):
     """Return settings without what the document has."""
     return replace(
         settings,
-        input=_without(settings.input, "lights", *ORIENTATION),
+        input=_without(settings.input, "lights", "regions", *ORIENTATION),
         output=_without(settings.output, "exposure", "temperature", dir=str(folder)),
         target=_without(settings.target, "kind", "strokes", "file", "mask", "rotate_degrees", "rest"),
         solve=_without(settings.solve, "freedom"),

@@ -17,6 +17,7 @@ from envedit.config.input_schema import Target
 from envedit.config.key_validators import Kelvin
 from envedit.config.light_schema import LightList
 from envedit.config.method_schema import Solve
+from envedit.config.region_schema import RegionList
 from envedit.config.schema import FIELDS
 from envedit.config.stroke_schema import StrokeList
 from envedit.config.validators import Choice, Number, String, WantedError, show
@@ -56,8 +57,8 @@ class Document:
     ----------
     strokes : tuple of dict
         As in ``[[target.strokes]]``.
-    lights : tuple of dict
-        As in ``[[input.lights]]``.
+    lights, regions : tuple of dict
+        As in ``[[input.lights]]`` and ``[[input.regions]]``.
     rotate_degrees, tilt_degrees, horizon_degrees : float
         As in ``[input]``.
     exposure, temperature : float
@@ -70,6 +71,7 @@ class Document:
 
     strokes: tuple[dict, ...] = ()
     lights: tuple[dict, ...] = ()
+    regions: tuple[dict, ...] = ()
     rotate_degrees: float = 0.0
     tilt_degrees: float = 0.0
     horizon_degrees: float = 0.0
@@ -80,13 +82,14 @@ class Document:
 
     @property
     def placing(self) -> tuple:
-        """What decides where the lights of the map are before paint: not their names, roles and order."""
+        """What decides what the map is before paint: not the names, roles and order of its lights."""
         lights = [
             {key: value for key, value in light.items() if key not in ("name", "role")}
             for light in self.lights
         ]
         changed = [light for light in lights if light != unchanged(light.get("light"))]
-        return sorted(json.dumps(light, sort_keys=True) for light in changed), self.orientation
+        placed = sorted(json.dumps(light, sort_keys=True) for light in changed)
+        return placed, self.regions, self.orientation
 
     @property
     def orientation(self) -> Orientation:
@@ -101,6 +104,7 @@ class Document:
 _CHECKS = {
     "strokes": StrokeList(),
     "lights": LightList(),
+    "regions": RegionList(),
     **{name: FIELDS["input"][name].metadata["check"] for name in ORIENTATION},
     "exposure": Number(-20, 20),
     "temperature": Kelvin(),

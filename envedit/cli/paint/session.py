@@ -37,14 +37,14 @@ from envedit.core.errors import ConfigError, InputError
 from envedit.core.seeds import Seeds
 from envedit.core.types import Views
 from envedit.export import adjustments, file_resolution
-from envedit.images import images
+from envedit.images import images, map_regions
 from envedit.losses import display_curve
 from envedit.losses.perceptual import installed
 from envedit.report import output_folder, run_folder
 from envedit.representations.layers import below_horizon
 from envedit.representations.layers.layers import Layers
 from envedit.representations.layers.lights import DARK
-from envedit.representations.layers.oriented import oriented
+from envedit.representations.layers.oriented import oriented, oriented_share
 from envedit.representations.layers.placed_lights import PlacedLights, angles
 from envedit.representations.layers.unseen import unseen_kept
 from envedit.scene.scene import Scene
@@ -228,10 +228,18 @@ class Session:
         self.origin = self._by_hand(document)
         given = self.project.settings.input
         horizon = below_horizon.treatment(given.horizon, given.rows, self.origin)
-        locked = self.placed.locked(document.lights)
-        if locked is not None:
-            locked = oriented(locked, document.orientation)[self.rows.slice]
-        layers = Layers.of(self.origin[self.rows.slice], self.rows.place, horizon=horizon, fixed=locked)
+        kept = map_regions.kept(document.regions, *self.map.shape[:2])
+        locked = self.placed.locked(self.placed.locking(document.lights, kept), document.regions)
+        locked = None if locked is None else oriented(locked, document.orientation)
+        kept = None if kept is None else oriented_share(kept, document.orientation)
+        self.kept = kept
+        layers = Layers.of(
+            self.origin[self.rows.slice],
+            self.rows.place,
+            horizon=horizon,
+            fixed=None if locked is None else locked[self.rows.slice],
+            kept=None if kept is None else kept[self.rows.slice],
+        )
         self.transport.resolve(self.origin, limit=COLUMNS)
         self.base = self.transport.apply(tensor(self.origin)).numpy()
         self.problem = map_problem.Problem(layers, self.transport, self.origin, self.base)
@@ -244,7 +252,8 @@ class Session:
         self._tell_lights()
 
     def _by_hand(self, document, lights=None):
-        return oriented(self.placed.place(document.lights), document.orientation, lights)
+        placed = map_regions.changed(self.placed.place(document.lights), document.regions)
+        return oriented(placed, document.orientation, lights)
 
     def _drag(self):
         """Show the map with its lights placed, and what paint has added to it before."""
@@ -509,6 +518,7 @@ class Session:
             painted=self.coverage[..., 0],
             rendered=self.base,
             known=self.point.edited,
+            kept=self.kept,
         )
         self._tell_unreachable()
         self.tell_state()
@@ -586,8 +596,8 @@ class Session:
         if self._wide is None:
             self._wide = self.given.at_file_size(settings, SKY_WIDTH)
         rotated = {name: getattr(document, name) for name in ORIENTATION}
-        by_hand = replace(settings, lights=document.lights, **rotated)
-        given = replace(self.given, placed=self.placed if document.lights else None)
+        by_hand = replace(settings, lights=document.lights, regions=document.regions, **rotated)
+        given = replace(self.given, placed=self.placed if document.lights or document.regions else None)
         params = self.problem.solution_params(self.run.state)
         edit = file_resolution.Found(self.problem.layers, params, None, 0.0, self.point.edited)
         _, carried = file_resolution.carried(by_hand, given, self._wide, edit, self.origin)

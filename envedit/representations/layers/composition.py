@@ -54,6 +54,7 @@ class Fields:
     log_gain: mi.Color3f | None = None  # the gain g
     # Share of the saturation and of the gain that acts on a texel, 0 to 1; None: all
     share: mi.Float | None = None
+    kept: mi.Float | None = None  # how far a texel stays as it is, 0 to 1; None: nowhere
 
 
 class Composed(NamedTuple):
@@ -103,6 +104,13 @@ def compose(base: mi.Color3f, directions: mi.Vector3f | None, fields: Fields) ->
     # ---- Gain
     if fields.log_gain is not None:
         sky = brightened(sky, dr.exp(_shared(fields.log_gain, fields.share)))
+
+    # ---- What is kept
+    if fields.kept is not None:
+        open_share = 1 - fields.kept
+        sky = fields.kept * base + open_share * sky
+        relit = fields.kept * base + open_share * relit
+        gone = None if gone is None else open_share * gone
     return Composed(sky, relit, gone)
 
 

@@ -78,6 +78,7 @@ class _Texels(NamedTuple):
     offset: mi.Color3f | None
     slope: mi.Color3f | None
     free: mi.Float | None
+    kept: mi.Float | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,6 +99,7 @@ class Layers:
     free: np.ndarray | None = None  # bool (rows, W), texels that gain and saturation act on; None: all
     # (rows, W, 3), radiance of locked lights, added to the cores whatever the parameters are; None: 0
     fixed: np.ndarray | None = None
+    kept: np.ndarray | None = None  # (rows, W), how far a texel stays as it is, 0 to 1; None: nowhere
 
     lr = 0.03
     models_edit = True
@@ -114,6 +116,7 @@ class Layers:
         horizon: Horizon = "free",
         aureoles: bool | np.ndarray = True,
         fixed: np.ndarray | None = None,
+        kept: np.ndarray | None = None,
     ) -> Layers:
         """Separate an image.
 
@@ -133,6 +136,8 @@ class Layers:
             a table, as for :class:`.Lights`.
         fixed : ndarray (rows, W, 3), optional
             What of the image is of locked lights: it is left out of the separation, and never changes.
+        kept : ndarray (rows, W), optional
+            How far a texel stays as it is, 0 to 1: that share of the original is in every decoded map.
 
         Raises
         ------
@@ -167,7 +172,7 @@ class Layers:
             behind = behind_glow.behind_glow(separation.background, separation.glow, away, rows)
 
         gain = GridGain(cycles, len(above) / rows[1], rows[0] == 0)
-        layers = cls(rows, image.shape[:2], separation, lights, gain, base, behind, fixed=fixed)
+        layers = cls(rows, image.shape[:2], separation, lights, gain, base, behind, fixed=fixed, kept=kept)
         return replace(layers, below=layers._below(low, horizon, away)) if len(low) else layers
 
     def _below(self, low, horizon, away):
@@ -235,7 +240,17 @@ class Layers:
 
     def _core(self, real):
         core = self.lights.core(real["turn"], real["flux"], real["size"], self.whole, self.rows)
+        if self.kept is not None:
+            share, own_core = self._kept_core
+            core = share * own_core + (1 - share) * core
         return core if self.fixed is None else core + tensor(self.fixed)
+
+    @functools.cached_property
+    def _kept_core(self):
+        """How far cores are kept, (rows, W, 3), and what they are of unmoved lights."""
+        real = self._real(self.start())
+        core = self.lights.core(real["turn"], real["flux"], real["size"], self.whole, self.rows)
+        return tensor(np.repeat(self.kept[..., None], 3, axis=2)), tensor(core.numpy())
 
     def _above(self, real, fields=None):
         """Compose the rows above the horizon, by default with the fields of the parameters."""
@@ -260,6 +275,7 @@ class Layers:
             log_saturation=_log_saturation(real),
             log_gain=self.gain.evaluate(real, self._grids) if "gain.0" in real else None,
             share=self._texels.free,
+            kept=self._texels.kept,
         )
 
     def _log_below(self, real, above, core):
@@ -281,6 +297,7 @@ class Layers:
             log_followed=None if log_followed is None else dr.unravel(mi.Color3f, log_followed.array),
             log_saturation=log_saturation if self.mirrored else None,
             log_gain=dr.unravel(mi.Color3f, log_gain.array),
+            kept=None if self.kept is None else dr.opaque(mi.Float(self.kept[self.shape[0] :].ravel())),
         )
         return compose(self.below.radiance, None, fields)
 
@@ -298,7 +315,8 @@ class Layers:
             offset = _colours(self.behind.offset)
             slope = _colours(self.behind.slope)
         free = None if self.free is None else dr.opaque(mi.Float(np.float32(self.free.ravel())))
-        return _Texels(directions, _colours(self.base), before, offset, slope, free)
+        kept = None if self.kept is None else dr.opaque(mi.Float(self.kept[:height].ravel()))
+        return _Texels(directions, _colours(self.base), before, offset, slope, free, kept)
 
     @functools.cached_property
     def _grids(self):
@@ -382,6 +400,11 @@ class Layers:
         """Rows and columns that lights and gain act on: of the image, or of its sky where rows follow it."""
         height, width, _ = self.base.shape
         return height, width
+
+    @property
+    def changeable(self) -> np.ndarray | float:
+        """How far each texel may change, (rows, W, 1); 1 where nothing is kept."""
+        return 1.0 if self.kept is None else 1 - self.kept[..., None]
 
     @property
     def active(self) -> slice:

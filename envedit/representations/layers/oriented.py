@@ -13,7 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from envedit.core import latlong
-from envedit.core.arrays import flat
+from envedit.core.arrays import ROUNDING, flat
 from envedit.core.rotations import Orientation
 from envedit.representations.layers import file_lights
 from envedit.representations.layers.separation import Light
@@ -35,6 +35,15 @@ def oriented(image: np.ndarray, orientation: Orientation, lights: list[Light] | 
     if orientation.level:
         return latlong.rotate(image, orientation.turn)
     return rotate(image, orientation.matrix, lights)
+
+
+def oriented_share(share: np.ndarray, orientation: Orientation) -> np.ndarray:
+    """Rotate a share of every texel (H, W), 0 to 1, as :func:`oriented` does the map: 0 and 1 stay exact."""
+    if orientation.level:
+        return latlong.rotate(share, orientation.turn)
+    rotated = oriented(np.repeat(share[..., None], 3, axis=2), orientation, [])[..., 0]
+    rotated[rotated > 1 - ROUNDING] = 1
+    return rotated
 
 
 def rotate(radiance: np.ndarray, matrix: np.ndarray, lights: list[Light] | None = None) -> np.ndarray:

@@ -16,6 +16,7 @@ from envedit.core import latlong
 from envedit.core.arrays import tensor
 from envedit.core.radiance import BRIGHTEST, require_radiance
 from envedit.core.rotations import rotation_vector
+from envedit.images import map_regions
 from envedit.representations.layers import below_horizon
 from envedit.representations.layers.layers import Layers
 from envedit.representations.layers.lights import DARK
@@ -85,10 +86,45 @@ class PlacedLights:
         require_radiance(envmap, "input.lights", brightest=BRIGHTEST)
         return envmap
 
-    def locked(self, placed: Sequence[dict]) -> np.ndarray | None:
-        """Return what locked lights add to the placed map, (H, W, 3) float32; None where none is locked."""
+    def locking(self, placed: Sequence[dict], kept: np.ndarray | None) -> tuple[dict, ...]:
+        """Return the entries, with those lights locked that stand where the map is kept, (H, W).
+
+        A light of the map without an entry gets one.
+        """
+        if kept is None:
+            return tuple(placed)
+        named = {light["light"] for light in placed if "light" in light}
+        own = [{"light": i + 1, "flux": [1.0] * 3, "size": 1.0} for i in range(len(self.lights))]
+        locked = []
+        for light in (*placed, *(light for light in own if light["light"] not in named)):
+            at = self._toward(light)
+            inside = False
+            if at is not None:
+                row, column = (round(float(v)) for v in latlong.texel_position(at, *kept.shape))
+                inside = kept[row, column % kept.shape[1]] >= map_regions.KEPT_SHARE
+            if inside:
+                locked.append(light | {"locked": True})
+            elif light in placed:
+                locked.append(light)
+        return tuple(locked)
+
+    def _toward(self, light):
+        """Return where the light of an entry stands, (3,); None where the map does not have it."""
+        if "azimuth" in light:
+            return direction(light["azimuth"], light["elevation"])
+        known = light["light"] <= len(self.lights)
+        return self.lights[light["light"] - 1].direction if known else None
+
+    def locked(self, placed: Sequence[dict], regions: Sequence[dict] = ()) -> np.ndarray | None:
+        """Return what locked lights add to the placed map, (H, W, 3) float32; None where none is locked.
+
+        ``regions`` are then changed in it (:func:`.map_regions.changed`).
+        """
         others = without_locked(placed)
-        return None if others is None else np.maximum(self.place(placed) - self.place(others), 0)
+        if others is None:
+            return None
+        whole, dark = (map_regions.changed(self.place(lights), regions) for lights in (placed, others))
+        return np.maximum(whole - dark, 0)
 
 
 def flux_of(light: dict) -> np.ndarray:

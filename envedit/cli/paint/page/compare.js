@@ -6,7 +6,7 @@ import { Zoom } from "./zoom.js";
 const $ = (id) => document.getElementById(id);
 const SHOWN_STEPS = 60;
 const THUMB = 48; // pixels high
-const NAMES = { strokes: "strokes", lights: "lights", rotate_degrees: "turn of the sky", tilt_degrees: "tilt", horizon_degrees: "horizon", exposure: "map exposure", temperature: "map temperature", rest: "the rest", freedom: "the sky may change" };
+const NAMES = { strokes: "strokes", lights: "lights", regions: "regions of the map", rotate_degrees: "turn of the sky", tilt_degrees: "tilt", horizon_degrees: "horizon", exposure: "map exposure", temperature: "map temperature", rest: "the rest", freedom: "the sky may change" };
 
 export class Compare {
   constructor(frames, displays, history, plain, on) {

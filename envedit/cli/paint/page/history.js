@@ -1,6 +1,6 @@
 // The document (what is saved), and what undo and redo go through. What EMPTY lacks, the server says.
 
-export const EMPTY = { strokes: [], lights: [], rotate_degrees: 0, tilt_degrees: 0, horizon_degrees: 0, exposure: 0, temperature: 0 };
+export const EMPTY = { strokes: [], lights: [], regions: [], rotate_degrees: 0, tilt_degrees: 0, horizon_degrees: 0, exposure: 0, temperature: 0 };
 
 export class History {
   constructor(changed) {

@@ -320,4 +320,4 @@ export const signed = (v) => `${v < -0.05 ? "−" : v > 0.05 ? "+" : ""}${Math.a
 const round = (v) => Math.round(v * 100) / 100;
 // sRGB of a colour input from and to linear values.
 export const linear = (text) => [1, 3, 5].map((i) => parseInt(text.slice(i, i + 2), 16) / 255).map((v) => (v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4));
-const hex = (rgb) => "#" + rgb.map((v) => (v <= 0.0031308 ? 12.92 * v : 1.055 * v ** (1 / 2.4) - 0.055)).map((v) => Math.round(255 * Math.min(1, Math.max(0, v))).toString(16).padStart(2, "0")).join("");
+export const hex = (rgb) => "#" + rgb.map((v) => (v <= 0.0031308 ? 12.92 * v : 1.055 * v ** (1 / 2.4) - 0.055)).map((v) => Math.round(255 * Math.min(1, Math.max(0, v))).toString(16).padStart(2, "0")).join("");

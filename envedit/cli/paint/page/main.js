@@ -7,7 +7,8 @@ import { accelerated, Display } from "./display.js";
 import { EMPTY, History } from "./history.js";
 import { Level } from "./level.js";
 import { LightList } from "./light_list.js";
-import { Lights, linear } from "./lights.js";
+import { hex, Lights, linear } from "./lights.js";
+import { Regions } from "./regions.js";
 import { Strokes } from "./strokes.js";
 import { Zoom } from "./zoom.js";
 
@@ -393,6 +394,25 @@ const level = new Level($("map-stack"), $("level-line"), $("level"), {
   },
   done: (change) => history.push(change),
 });
+const regions = new Regions($("map-stack"), $("handles"), $("regions"), {
+  button: $("region"), set: $("region-panel"), action: $("region-action"), radius: $("region-radius"), softness: $("region-softness"),
+  scaled: $("region-scaled"), list: $("region-list"), remove: $("region-remove"),
+  inputs: ["action", "radius", "softness", "stops", "color"].map((name) => $(`region-${name}`)),
+}, {
+  document: () => history.document,
+  preview: (change) => history.preview(change, "dragging"),
+  done: (change) => history.push(change),
+  factor() {
+    const tint = linear($("region-color").value), most = Math.max(...tint, 1e-3);
+    return tint.map((v) => Number(((v / most) * 2 ** Number($("region-stops").value)).toPrecision(5)));
+  },
+  show(factor) {
+    const most = Math.max(...factor);
+    if (!most) return; // black has no colour
+    $("region-stops").value = Math.round(100 * Math.log2(most)) / 100;
+    $("region-color").value = hex(factor.map((v) => v / most));
+  },
+});
 $("level").addEventListener("click", () => { $("level-degrees").hidden = $("level-hint").hidden = $("level-line").hidden; });
 
 // ---- controls
@@ -417,6 +437,7 @@ function refresh() {
   lights.draft = null;
   lights.draw();
   level.draw();
+  regions.draw();
   strokes.draw();
   compare.draw();
 }
@@ -523,6 +544,7 @@ window.addEventListener("keydown", (event) => {
   else if (key === "o" && !event.repeat) outline();
   else if (key === "m") compare.large();
   else if (key === "l") $("level").click();
+  else if (key === "g") regions.toggle();
   else if (key === "a") compare.keep();
   else if (key === "h") compare.toggle();
   else if (key === "+" || key === "-") zooms[0].by(key === "+" ? 1.2 : 1 / 1.2);

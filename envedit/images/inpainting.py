@@ -1,0 +1,154 @@
+"""A region of a map filled from around it, by OpenCV's inpainting (Telea 2004), an extra.
+
+Near the poles a lat-long image is stretched, and at its edge a region is in two parts. What surrounds the
+region is therefore resampled to the azimuthal equidistant projection about its middle, filled there in log
+radiance, and only the region's texels are put back.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from envedit.core import latlong
+from envedit.core.errors import MachineError
+
+MOST_PIXELS = 1024
+"""Pixels across of the projection: a larger one takes seconds, and what is filled in is smooth."""
+MARGIN = 8
+"""Pixels of the surroundings on each side; Telea's method reads :data:`RADIUS` of them."""
+RADIUS = 3
+CODES = 1e5
+"""Range of the values that OpenCV is given: to its estimate it adds up to sqrt(2) whatever their unit is
+(``Jx + Jy`` over its length, in photo/src/inpaint.cpp), of this range 1e-5."""
+ROWS = 128
+
+
+class NothingAroundError(ValueError):
+    """The region is all of the map."""
+
+
+def filled(envmap: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Return a map with a region replaced by what continues its surroundings.
+
+    Parameters
+    ----------
+    envmap : ndarray (H, W, 3) float32
+        Linear radiance, finite and not negative.
+    weight : ndarray (H, W)
+        How far a texel is replaced, 0 to 1.
+
+    Returns
+    -------
+    ndarray (H, W, 3) float32
+        Texels of weight 0 have the bits of ``envmap``. What is filled in is within the range of what is
+        :data:`RADIUS` pixels around the region, in each channel.
+
+    Raises
+    ------
+    NothingAroundError
+        The weight is above 0 everywhere.
+    MachineError
+        OpenCV is not installed.
+    """
+    cv2 = _opencv()
+    mask = weight > 0
+    if not mask.any():
+        return envmap
+    if mask.all():
+        raise NothingAroundError
+
+    # ---- The projection: its middle, pixels and directions
+    height, width, _ = envmap.shape
+    texel = np.pi / (height - 1)
+    frame, radius = _cap(mask)
+    pixel = max(texel, 2 * radius / MOST_PIXELS)
+    half = int(np.ceil(min(radius, np.pi) / pixel)) + MARGIN
+    offset = pixel * np.arange(-half, half + 1)
+    x, y = np.meshgrid(offset, offset)
+    angle = np.hypot(x, y)
+    sine = np.sinc(angle / np.pi)  # sin(angle) / angle
+    plane = np.stack([x * sine, y * sine, np.cos(angle)], axis=-1) @ frame
+
+    # ---- The map in it; unknown is what reads a texel of the region
+    corners, shares = _around(latlong.texel_position(plane, height, width), (height, width))
+    unknown = np.logical_or.reduce([mask[corner] for corner in corners]) | (angle > np.pi)
+    known = sum(share[..., None] * envmap[corner] for corner, share in zip(corners, shares, strict=True))
+    ring = cv2.dilate(unknown.astype(np.uint8), np.ones(2 * (2 * RADIUS + 1,), np.uint8)) > 0
+    ring &= ~unknown
+    if not ring.any():
+        raise NothingAroundError
+
+    # ---- Filled in log radiance, channel by channel
+    image = np.empty(known.shape)
+    for c in range(3):
+        around = known[ring][:, c]
+        positive = around[around > 0]
+        floor = positive.min() if len(positive) else 1.0
+        low, high = np.log(floor), np.log(max(around.max(), floor))
+        scale = CODES / max(high - low, 1e-6)
+        codes = np.clip((np.log(np.maximum(known[..., c], floor)) - low) * scale, 0, CODES)
+        done = cv2.inpaint(np.float32(codes), unknown.astype(np.uint8), RADIUS, cv2.INPAINT_TELEA)
+        radiance = np.exp(low + np.clip(np.float64(done), 0, CODES) / scale)
+        image[..., c] = np.clip(radiance, around.min(), around.max())
+
+    # ---- The region's texels of it
+    result = envmap.copy()
+    for first in range(0, height, ROWS):
+        rows, columns = np.nonzero(mask[first : first + ROWS])
+        if not len(rows):
+            continue
+        toward = latlong.directions(height, width, slice(first, min(first + ROWS, height)))[rows, columns]
+        x, y, z = (toward @ frame.T).T
+        across = np.hypot(x, y)
+        stretch = np.arctan2(across, z) / np.maximum(across, 1e-12) / pixel
+        place = np.clip(np.stack([y, x]) * stretch + half, 0, 2 * half)
+        corners, shares = _around(place, image.shape[:2], wrap=False)
+        filling = sum(share[:, None] * image[at] for at, share in zip(corners, shares, strict=True))
+        share = weight[first + rows, columns][:, None]
+        old = envmap[first + rows, columns]
+        result[first + rows, columns] = np.where(share == 1, filling, old + share * (filling - old))
+    return result
+
+
+def _opencv():
+    try:
+        import cv2
+    except ImportError:
+        raise MachineError(
+            'input.regions: action = "fill" needs OpenCV, which is not installed: '
+            "run pip install '.[inpaint]' in the checkout"
+        ) from None
+    return cv2
+
+
+def _cap(mask):
+    """Return axes (3, 3), of which the last is the middle of a mask (H, W), and the angle that it reaches."""
+    height, width = mask.shape
+    step = max(1, height // 256)
+    coarse = np.logical_or.reduceat(mask, np.arange(0, height, step), axis=0)
+    coarse = np.logical_or.reduceat(coarse, np.arange(0, width, step), axis=1)
+    rows, columns = (np.minimum(at * step + step // 2, most - 1) for at, most in
+                     zip(np.nonzero(coarse), mask.shape, strict=True))  # fmt: skip
+    polar = np.pi * rows / (height - 1)
+    toward = latlong.on_sphere(polar, 2 * np.pi * (columns + 0.5) / width)
+    middle = (toward * np.sin(polar)[:, None]).sum(axis=0) + 1e-9 * toward[0]
+    middle /= np.linalg.norm(middle)
+    side = np.eye(3)[np.argmin(np.abs(middle))]
+    right = np.cross(side, middle)
+    right /= np.linalg.norm(right)
+    away = 2 * np.arcsin(np.minimum(np.linalg.norm(toward - middle, axis=1) / 2, 1)).max()
+    return np.stack([right, np.cross(middle, right), middle]), away + 2 * step * np.pi / (height - 1)
+
+
+def _around(place, shape, wrap=True):
+    """Return the four indices around places (rows, columns), and their shares in bilinear interpolation."""
+    row, column = place
+    height, width = shape
+    top = np.clip(np.floor(row).astype(np.int64), 0, max(height - 2, 0))
+    left = np.floor(column).astype(np.int64)
+    if not wrap:
+        left = np.clip(left, 0, width - 2)
+    down, right = row - top, column - left
+    corners = [(top + i, (left + j) % width) for i in (0, 1) for j in (0, 1)]
+    shares = [(1 - down) * (1 - right), (1 - down) * right, down * (1 - right), down * right]
+    return corners, shares

@@ -13,8 +13,8 @@ from experiments.harness import Experiment, calling, done_of, figure
 from experiments.paint.figure10 import RENDERED, opened, place, prepared
 
 MEMORY_EVERY_S = 1.0
-ACTIONS = ["stroke"] * 6 + ["light"] * 3 + ["undo", "redo", "button", "turn", "wheel", "key", "reload"]
-BUTTONS = ("add-light", "light-mute", "light-delete", "clear", "shape-polygon")
+ACTIONS = ["stroke"] * 6 + ["light"] * 3 + ["region", "undo", "redo", "button", "turn", "wheel", "key", "reload"]
+BUTTONS = ("add-light", "light-mute", "light-delete", "region-remove", "clear", "shape-polygon")
 KEYS = ("b", "1", "5", "[", "]", "Escape", "Enter", "Control+z", "ArrowLeft")
 LONGEST_PAUSE_S = 2.0
 """Between two actions, so that some of them are solved for and others are superseded."""
@@ -42,6 +42,12 @@ def act(page, chance: random.Random) -> str:
         handles = page.locator(".handle")
         handles.nth(chance.randrange(handles.count())).hover(force=True)
         drag(page, [spot("#map-stack") for _ in range(chance.randrange(1, 12))], begun=True)
+    elif what == "region":
+        page.get_by_test_id("region").click()
+        kind = page.get_by_test_id("region-action")
+        if kind.is_visible():
+            kind.select_option(chance.choice(["keep", "scale", "fill"]))
+            drag(page, [spot("#map-stack") for _ in range(chance.randrange(2, 6))])
     elif what in ("undo", "redo"):
         page.get_by_test_id(what).click(force=True)
     elif what == "button":

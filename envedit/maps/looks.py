@@ -10,8 +10,10 @@ white balance, of what lights do not do to it.
 from __future__ import annotations
 
 import math
+import os
 import tomllib
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -262,11 +264,18 @@ def read(path: FilePath) -> Look:
     cannot be read.
     """
     try:
-        with open(path, "rb") as file:
-            table = tomllib.load(file)
+        return parse(Path(path).read_text(encoding="utf-8"), os.fsdecode(path))
     except OSError as error:
         raise InputError(f"{path}: {error.strerror}") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path}: not TOML: {error}") from None
+
+
+def parse(text: str, path: str) -> Look:
+    """Read a look from the text of a file; ConfigError as of :func:`read`."""
+    try:
+        table = tomllib.loads(text)
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise ConfigError(f"{path}: not TOML: {error}") from None
     lights = {role: table.pop(role) for role in ROLES if role in table}
     values = _numbers(path, "", table, _NUMBERS)

@@ -4,6 +4,7 @@ Not in the module of a server that is shared: one thread of a process may use Dr
 """
 
 import json
+import os
 import struct
 from pathlib import Path
 
@@ -13,6 +14,7 @@ import pytest
 from envedit import config, pipeline
 from envedit.cli.paint import protocol
 from envedit.images import images
+from envedit.maps import look_transfer, looks
 from envedit.targets.pixel_weights import FOLLOWING
 from tests.oracles.builders import LIGHT, write_scene
 from tests.oracles.painting import OF_TWO, SMALL, TWO_VIEWS, asked, connected, heard, served
@@ -169,3 +171,36 @@ def test_a_scene_is_opened_from_the_start_page_and_mistakes_are_told(tmp_path, m
         assert "missing.exr" in heard(page, "error")["text"]
         page.send(json.dumps({"type": "open", "name": "edit.toml"}))
         assert heard(page, "opened")["width"] == 48
+
+
+def test_a_look_gives_the_painting_another_map(tmp_path, monkeypatch):
+    """Strokes and added lights stay, the map is a file, and the painting before is as it was."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "edit.toml").write_text(SMALL)
+    key = looks.RoleLight(azimuth=250.0, elevation=20.0, flux=1.5, radius=0.0, tint=(1.6, 0.89, 0.2))
+    look = looks.to_toml(looks.Look(lights={"key": key}))
+    stroke = {"type": "shadow", "polygon": [[0.4, 0.7], [0.6, 0.7], [0.5, 0.9]], "amount": 0.3}
+    added = {"azimuth": 10.0, "elevation": 50.0, "flux": [1.0, 1.0, 1.0], "size": 3.0}
+    own = {"light": 1, "flux": [0.5, 0.5, 0.5], "size": 1.0}
+    with served(tmp_path / "edit.toml") as server, connected(server) as socket:
+        heard(socket, "opened")
+        document = {"strokes": [stroke], "lights": [own, added], "tilt_degrees": 5.0}
+        socket.send(json.dumps({"type": "document", "document": document, "number": 1}))
+        heard(socket, "status", lambda message: message["number"] == 1)
+        before = server.worker.session.map
+        kept = (tmp_path / "edit_out" / "painted.toml").read_bytes()
+        socket.send(json.dumps({"type": "look", "name": "../dusk now.toml", "text": look}))
+        opened = heard(socket, "opened")
+        assert "maps/sunsky_dusk_now.exr" in heard(socket, "told")["text"]
+        assert len(opened["document"]["strokes"]) == 1 and opened["document"]["tilt_degrees"] == 5
+        assert [light.get("light") for light in opened["document"]["lights"]] == [None]
+        written = images.read("maps/sunsky_dusk_now.exr")[0]
+        assert np.array_equal(written, look_transfer.apply(before, looks.parse(look, "look")))
+        assert np.array_equal(server.worker.session.map, written)
+        assert server.worker.session.project.folder == tmp_path / "edit_out-2"
+        assert (tmp_path / "edit_out" / "painted.toml").read_bytes() == kept
+        # ---- What is no look is refused, and the painting stays
+        session = server.worker.session
+        socket.send(json.dumps({"type": "look", "name": "bad.toml", "text": look.replace("flux", "fluxx")}))
+        assert "bad.toml: key.fluxx: unknown key" in heard(socket, "error")["text"]
+        assert server.worker.session is session and os.listdir("maps") == ["sunsky_dusk_now.exr"]

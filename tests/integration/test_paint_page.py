@@ -13,6 +13,7 @@ from envedit.core.color import luminance
 from envedit.core.rotations import Orientation
 from envedit.core.tone_curves import TONE_CURVES
 from envedit.images import analytic_sky, images
+from envedit.maps import looks
 from envedit.representations.layers.placed_lights import angles, direction
 from envedit.targets.strokes import gains
 from tests.oracles.builders import LIGHT, write_scene
@@ -546,6 +547,17 @@ def test_a_map_is_chosen_levelled_and_painted_and_lights_are_ordered(browser, tm
         assert config.load(kept).input.envmap == str(tmp_path / "sky.exr")
         regions_are_painted(page, kept, server.worker.session)
         lights_are_ordered(page, kept)
+        # ---- The light of another edit
+        look = looks.to_toml(
+            looks.Look(lights={"key": looks.RoleLight(90.0, 30.0, 2.0, 0.0, (1.0, 1.0, 1.0))})
+        )
+        file = {"name": "noon.toml", "mimeType": "", "buffer": look.encode()}
+        page.page.get_by_test_id("look-file").set_input_files(file)
+        sync_api.expect(page.page.get_by_test_id("message")).to_contain_text("maps/sky_noon.exr")
+        until(
+            lambda: np.allclose(server.worker.session.placed.lights[0].direction, direction(90, 30), atol=0.1)
+        )
+        page.shot("look")
         assert not page.faults, page.faults
 
 

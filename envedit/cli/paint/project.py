@@ -196,6 +196,18 @@ def opened(name: str, envmap: str = "", preset: str | None = None, camera: str =
     return _continued(Project(plain, folder, base, document))
 
 
+def on_another_map(before: Project, document: Document, envmap: str) -> Project:
+    """Return the painting of a document on another map, without what it says of the lights of its own.
+
+    Its folder is beside that of the painting before; a painting of this map that is there is gone on with.
+    """
+    given = _without(before.settings.input, "unclip", "repair", "colour_space", envmap=_path(envmap))
+    added = tuple(light for light in document.lights if "light" not in light)
+    document = replace(document, lights=added)
+    settings = replace(before.settings, input=given)
+    return _continued(Project(settings, before.folder, before.base, document))
+
+
 def _of_photo(settings, base):
     """Return a project on the map that explains a photograph, which one run makes for each photograph."""
     files = *settings.target.files, *settings.target.masks

@@ -196,6 +196,14 @@ class Choose:
 
 
 @dataclass(frozen=True)
+class ApplyLook:
+    """Paint on, on the map in the light of a look: the name and text of its file (:mod:`.looks`)."""
+
+    name: str
+    text: str
+
+
+@dataclass(frozen=True)
 class Sky:
     """Show the map large, as edited and as it was given."""
 
@@ -205,7 +213,7 @@ class Save:
     """Write the results."""
 
 
-def read(text: str | bytes, client: str = "") -> Edit | Pick | Choose | Open | Sky | Save:
+def read(text: str | bytes, client: str = "") -> Edit | Pick | Choose | Open | ApplyLook | Sky | Save:
     """Read a message from the page.
 
     Raises
@@ -241,11 +249,14 @@ def read(text: str | bytes, client: str = "") -> Edit | Pick | Choose | Open | S
             return Open(name, envmap)
         if kind == "choose":
             return Choose(_count(found.get("explanation")))
+        if kind == "look":
+            return ApplyLook(String()(found.get("name")), String()(found.get("text")))
     except WantedError as error:
         raise BadMessageError(f"{kind}: expected {error}") from None
     if kind in ("sky", "save"):
         return Sky() if kind == "sky" else Save()
-    raise BadMessageError(f"type: got {show(kind)[:80]}, expected document, pick, choose, open, sky or save")
+    wanted = "expected document, pick, choose, open, look, sky or save"
+    raise BadMessageError(f"type: got {show(kind)[:80]}, {wanted}")
 
 
 def _refused(name):

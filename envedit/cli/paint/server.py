@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import filecmp
 import hmac
 import os
 import re
@@ -23,7 +22,7 @@ from starlette.responses import FileResponse, PlainTextResponse, Response
 from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from envedit.cli.paint import project, protocol, thumbnails
+from envedit.cli.paint import maps_folder, project, protocol, thumbnails
 from envedit.cli.paint.session import Tell
 from envedit.cli.paint.worker import Again, Worker
 from envedit.core import shipped
@@ -42,8 +41,6 @@ TYPES = {
 MOST_CLIENTS = 8
 LARGEST_MAP = 1 << 30
 """Bytes of a map that is dropped on the page."""
-MAPS = "maps"
-"""Folder, in the working folder, that maps are put in which are dropped on the start page."""
 _MAP_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_. -]{0,100}\.(exr|hdr|png|jpg|jpeg)", re.IGNORECASE)
 _SAFE = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
@@ -233,26 +230,25 @@ class Server:
         if not _MAP_NAME.fullmatch(name):
             wanted = "expected a plain name that ends in .exr, .hdr, .png or .jpg"
             return PlainTextResponse(wanted, 400, _SAFE)
-        folder = Path.cwd() / MAPS
-        part, size = folder / f".{name}.{secrets.token_hex(8)}", 0
+        part, size = None, 0
         try:
-            folder.mkdir(exist_ok=True)
+            part = maps_folder.part(name)
             with open(part, "xb") as file:
                 async for piece in request.stream():
                     size += len(piece)
                     if size > LARGEST_MAP:
                         return PlainTextResponse(f"more than {LARGEST_MAP} bytes", 413, _SAFE)
                     file.write(piece)
-            name = _free(part, folder, name)
-            part.replace(folder / name)
+            name = maps_folder.place(part, name)
         except (OSError, ClientDisconnect) as error:
             return PlainTextResponse(f"not written: {error}", 500, _SAFE)
         finally:
             with contextlib.suppress(OSError):
-                part.unlink(missing_ok=True)
+                if part is not None:
+                    part.unlink(missing_ok=True)
         self.hub.say(_start())
-        self.thumbnails.make([(f"{MAPS}/{name}", True)])
-        return PlainTextResponse(f"{MAPS}/{name}", headers=_SAFE)
+        self.thumbnails.make([(name, True)])
+        return PlainTextResponse(name, headers=_SAFE)
 
     async def _socket(self, socket: WebSocket) -> None:
         if not self._known(socket) or socket.headers.get("origin") not in self.origins:
@@ -294,15 +290,6 @@ class Server:
                 await sender
 
 
-def _free(part, folder, name):
-    """Return a name under which a file replaces none of other content: this one, or it with a number."""
-    stem, ending, number = Path(name).stem, Path(name).suffix, 1
-    while (there := folder / name).exists() and not filecmp.cmp(part, there, shallow=False):
-        number += 1
-        name = f"{stem}-{number}{ending}"
-    return name
-
-
 async def _send(client, socket):
     """Send what waits for a page, until it goes."""
     with contextlib.suppress(WebSocketDisconnect, RuntimeError):
@@ -313,9 +300,10 @@ async def _send(client, socket):
 
 def _start():
     """Return what the start page offers."""
+    folders = [Path.cwd(), Path.cwd() / maps_folder.MAPS]
     return {
         "type": "start",
-        "maps": [os.path.relpath(file) for file in thumbnails.maps([Path.cwd(), Path.cwd() / MAPS])],
+        "maps": [os.path.relpath(file) for file in thumbnails.maps(folders)],
         "scenes": list(shipped.complete_scenes()),
         "configurations": [name for name in shipped.configurations() if name.startswith("edits/")],
         "recent": project.recent(),

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import contextlib
+import re
 import sys
 import threading
 import traceback
 from pathlib import Path
 
 from envedit.cli import run
-from envedit.cli.paint import project
-from envedit.cli.paint.protocol import Choose, Edit, Open, Pick, Save, Sky
+from envedit.cli.paint import maps_folder, project
+from envedit.cli.paint.protocol import ApplyLook, Choose, Edit, Open, Pick, Save, Sky
 from envedit.cli.paint.session import Session, SupersededError, Tell
-from envedit.core.errors import EnveditError, unwrapped
+from envedit.core.errors import EnveditError, InputError, unwrapped
+from envedit.maps import look_transfer, looks, map_file
 from envedit.targets.strokes import gains
 
-ORDER = (Open, Pick, Edit, Choose, Sky, Save)
+ORDER = (Open, ApplyLook, Pick, Edit, Choose, Sky, Save)
 """Of requests that wait, which kind goes first: what is saved has all edits."""
 
 
@@ -97,12 +99,7 @@ class Worker(threading.Thread):
 
     def _carry_out(self, request):
         if isinstance(request, Open):
-            before = self.session
             self._open(project.opened(request.name, request.envmap))
-            if before is not None:
-                with self._lock:  # what came meanwhile is about what was open before
-                    for kind in (Edit, Pick, Choose, Sky, Save):
-                        self._waiting.pop(kind, None)
         elif self.session is None:
             if not isinstance(request, Again):
                 self.tell.say({"type": "error", "text": "no scene is open: open one first"})
@@ -113,6 +110,8 @@ class Worker(threading.Thread):
             self.session.pick(request)
         elif isinstance(request, Choose):
             self.session.choose(request.explanation)
+        elif isinstance(request, ApplyLook):
+            self._apply(request)
         elif isinstance(request, Sky):
             self.session.sky()
         elif isinstance(request, Save):
@@ -123,6 +122,26 @@ class Worker(threading.Thread):
                 self.session.tell_state()
         else:
             self.session.again()
+
+    def _apply(self, request):
+        """Open the painting on the map in the light of a look, which is written among the maps."""
+        session, look = self.session, looks.parse(request.text, request.name)
+        self.tell.say({"type": "status", "state": "loading", "text": f"Applying {request.name} to the map"})
+        given = session.given.at_file_size(session.project.settings.input)
+        edited = given.as_stored(look_transfer.apply(given.radiance, look))
+        plain = re.sub(r"[^\w-]", "_", Path(request.name).stem)
+        name = f"{Path(given.source).stem}_{plain}.exr"
+        try:
+            part = maps_folder.part(name)
+            with contextlib.ExitStack() as stack:
+                stack.callback(part.unlink, missing_ok=True)
+                warnings = map_file.write(part, edited, given)
+                file = maps_folder.place(part, name)
+        except OSError as error:
+            raise InputError(f"{maps_folder.MAPS}/{name}: not written: {error.strerror}") from None
+        self._open(project.on_another_map(session.project, session.document, file))
+        said = [f"The map has the light of {request.name}: {file}", *warnings]
+        self.tell.say({"type": "told", "text": ". ".join(said)})
 
     def _open(self, opened):
         """Open a painting in the place of the one that is open, which stays if that fails."""
@@ -148,6 +167,10 @@ class Worker(threading.Thread):
                 mi.set_variant(variant)
             raise
         self.session = session
+        if before is not None:
+            with self._lock:  # what came meanwhile is about what was open before
+                for kind in (Edit, Pick, Choose, Sky, Save):
+                    self._waiting.pop(kind, None)
         self._painting += 1
         project.note(opened)
         scene = run.scene_name(self.session.scene.path)

@@ -223,9 +223,10 @@ const RECEIVED = {
   saved(message) {
     say("", true);
     $("progress").hidden = true;
-    const links = message.files.filter((name) => ["report.html", "edited.exr", "edited_full.exr", "edited_full.hdr", "lights.json"].includes(name));
+    const links = message.files.filter((name) => ["report.html", "edited.exr", "edited_full.exr", "edited_full.hdr", "lights.json", "look.toml"].includes(name));
     $("message").replaceChildren(`Saved in ${message.folder}: `, ...links.flatMap((name) => [Object.assign(document.createElement("a"), { href: `result/${name}`, textContent: name, target: "_blank" }), " "]), ...[...message.notes, ...message.warnings].map((line) => `${line}. `));
   },
+  told(message) { say(message.text, true); },
   refused(message) { say(message.text); },
   error(message) { $("progress").hidden = true; say(message.text); state("error", "Error"); },
 };
@@ -507,6 +508,15 @@ for (const [id, key] of [...ORIENTATION, ["map-exposure", "exposure"], ["map-tem
     } else history.push({ [key]: value });
   });
 }
+
+$("look").addEventListener("click", () => $("look-file").click());
+$("look-file").addEventListener("change", async () => {
+  const [file] = $("look-file").files;
+  $("look-file").value = ""; // the same file may be chosen again
+  if (!file) return;
+  say("");
+  connection.send({ type: "look", name: file.name, text: await file.text() });
+});
 
 // The sliders of the whole map: 6500 K changes nothing.
 for (const [id, key, nothing] of [["map-exposure", "exposure", 0], ["map-temperature", "temperature", 6500]]) {

@@ -44,13 +44,22 @@ OWN: dict[str, Check] = {
     **_LISTED,
 }
 """Of a light of the map: its number, those with most flux first; where it goes; factors on flux and size."""
-SHAPES = {"gaussian": 1.0, "disc": 1.0, "rectangle": 1.0, "ring": 1.0, "gradient": 1.0, "strip": 0.1}
-"""Shapes of a light that is added, each with its ``aspect`` where none is given."""
+SHAPES = {
+    "gaussian": 1.0,
+    "disc": 1.0,
+    "rectangle": 1.0,
+    "ring": 1.0,
+    "gradient": 1.0,
+    "strip": 0.1,
+    "image": None,
+}
+"""Shapes of a light that is added, each with its ``aspect`` where none is given; None: its own."""
 ADDED: dict[str, Check] = {
     **_PLACE,
     "flux": _FLUX,
     "size": Number(0.01, 90),
     "shape": Choice(*SHAPES),
+    "image": String(),
     "aspect": Number(0.01, 1),
     "rotation": Number(-360, 360),
     "softness": Number(0, 1),
@@ -65,8 +74,10 @@ MEANINGS = {
     "size": "of the map's light: factor on its size, to 20; of an added one: radius in degrees, or half "
     "of its longer side",
     "shape": "of an added light; ring: the hole has half the radius; gradient: a rectangle that falls from "
-    "its upper side to black at its lower one; strip: with round ends",
-    "aspect": "of an added light: its shorter side over its longer one; without it 1, of a strip 0.1",
+    "its upper side to black at its lower one; strip: with round ends; image: a rectangle with a picture",
+    "image": "file of a light of shape image, and needed there: its colours are the picture's times flux",
+    "aspect": "of an added light: its shorter side over its longer one; without it 1, of a strip 0.1, of an "
+    "image the picture's",
     "rotation": "likewise: degrees by which its longer side is turned to the left from the horizontal",
     "softness": "likewise, but not of a Gaussian: 0 has a sharp border, 1 fades from the middle",
     "name": "what it is called in the page of `envedit paint`",
@@ -128,6 +139,8 @@ def _light(name: str, light: dict[str, Any]) -> dict[str, Any]:
         raise ConfigError(f"{name}: got one of azimuth and elevation, expected both or none")
     if "light" in light:
         return {"flux": [1.0, 1.0, 1.0], "size": 1.0} | found
+    if (found.get("shape") == "image") != bool(found.get("image")):
+        raise ConfigError(f'{name}: got one of shape = "image" and image = FILE, expected both or none')
     for key in ("azimuth", "flux"):
         if key not in found:
             raise ConfigError(f"{name}.{key}: got none, expected one: a light without `light` is added")

@@ -173,3 +173,9 @@ def resolve_paths(merged: dict[str, Any], base: Path, stem: str) -> None:
             several = isinstance(value, tuple)
             found = tuple(v and str(base / v) for v in value) if several else str(base / value)
             merged[table] = merged[table] | {key: found}
+    lights = merged.get("input", {}).get("lights", ())
+    if any("image" in light for light in lights):
+        with_paths = (
+            light | {"image": str(base / light["image"])} if "image" in light else light for light in lights
+        )
+        merged["input"] = merged["input"] | {"lights": tuple(with_paths)}

@@ -13,11 +13,20 @@ from experiments.harness import Experiment, calling, done_of, figure
 from experiments.paint.figure10 import RENDERED, opened, place, prepared
 
 MEMORY_EVERY_S = 1.0
-ACTIONS = ["stroke"] * 6 + ["light"] * 3 + ["region", "undo", "redo", "button", "turn", "wheel", "key", "reload"]
+ACTIONS = (
+    ["stroke"] * 6 + ["light"] * 3 + ["region", "undo", "redo", "button", "turn", "wheel", "key", "reload"]
+)
 BUTTONS = ("add-light", "light-mute", "light-delete", "region-remove", "clear", "shape-polygon")
 KEYS = ("b", "1", "5", "[", "]", "Escape", "Enter", "Control+z", "ArrowLeft")
 LONGEST_PAUSE_S = 2.0
 """Between two actions, so that some of them are solved for and others are superseded."""
+SEEN_HANDLES = """() => {
+  document.querySelector("#right").scrollTo(0, 0);
+  return [...document.querySelectorAll(".handle")].map((handle) => [handle, handle.getBoundingClientRect()])
+    .map(([handle, box]) => [handle, box.x + box.width / 2, box.y + box.height / 2])
+    .filter(([handle, x, y]) => document.elementFromPoint(x, y) === handle).map(([, x, y]) => [x, y]);
+}"""
+"""Middles of the handles that a pointer can reach, in pixels of the page."""
 OWN = {"edit.toml", "edit_out", "server.log"}
 """What may lie in the folder that the command works in."""
 
@@ -39,9 +48,9 @@ def act(page, chance: random.Random) -> str:
                 buttons.nth(chance.randrange(buttons.count())).click()
         drag(page, [spot("#overlay") for _ in range(chance.randrange(2, 12))])
     elif what == "light":
-        handles = page.locator(".handle")
-        handles.nth(chance.randrange(handles.count())).hover(force=True)
-        drag(page, [spot("#map-stack") for _ in range(chance.randrange(1, 12))], begun=True)
+        seen = page.evaluate(SEEN_HANDLES)  # the map may be zoomed
+        if seen:
+            drag(page, [chance.choice(seen), *(spot("#map-stack") for _ in range(chance.randrange(1, 12)))])
     elif what == "region":
         page.get_by_test_id("region").click()
         kind = page.get_by_test_id("region-action")
@@ -70,10 +79,9 @@ def act(page, chance: random.Random) -> str:
     return what
 
 
-def drag(page, places, begun=False):
-    """Drag the pointer over places; ``begun``: from where it is."""
-    if not begun:
-        page.mouse.move(*places[0])
+def drag(page, places):
+    """Drag the pointer over places."""
+    page.mouse.move(*places[0])
     page.mouse.down()
     for spot in places:
         page.mouse.move(*spot)

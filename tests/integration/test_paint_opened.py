@@ -191,7 +191,7 @@ def test_a_look_gives_the_painting_another_map(tmp_path, monkeypatch):
         kept = (tmp_path / "edit_out" / "painted.toml").read_bytes()
         socket.send(json.dumps({"type": "look", "name": "../dusk now.toml", "text": look}))
         opened = heard(socket, "opened")
-        assert "maps/sunsky_dusk_now.exr" in heard(socket, "told")["text"]
+        assert "maps/sunsky_dusk_now.exr" in heard(socket, "note")["text"]
         assert len(opened["document"]["strokes"]) == 1 and opened["document"]["tilt_degrees"] == 5
         assert [light.get("light") for light in opened["document"]["lights"]] == [None]
         written = images.read("maps/sunsky_dusk_now.exr")[0]

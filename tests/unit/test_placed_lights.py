@@ -6,7 +6,8 @@ import pytest
 from envedit import config, inputs, pipeline
 from envedit.config import light_schema
 from envedit.core import latlong
-from envedit.core.errors import ConfigError
+from envedit.core.color import LUMINANCE
+from envedit.core.errors import ConfigError, InputError
 from envedit.core.rotations import Orientation
 from envedit.export import file_resolution
 from envedit.images import images
@@ -92,7 +93,7 @@ AREA = {
 """Of each shape in steradian, for a size of 6 degrees and an aspect of 1/2, as if the sphere were flat."""
 
 
-@pytest.mark.parametrize("shape", light_schema.SHAPES)
+@pytest.mark.parametrize("shape", [one for one in light_schema.SHAPES if one != "image"])
 @pytest.mark.parametrize("softness", [0.0, 1.0])
 @pytest.mark.parametrize("elevation", [-90.0, 20.0, 89.9])
 def test_a_shape_has_its_flux_its_area_and_its_place(shape, softness, elevation):
@@ -135,7 +136,47 @@ def test_rotation_turns_a_shape_to_the_left_and_softness_moves_no_border(elevati
                 angle = np.radians([half - 0.01, half + 0.01])[:, None]
                 border = profile(placed, np.cos(angle) * toward + np.sin(angle) * axis, np.radians(0.2))
                 assert border.mean() == pytest.approx(0.5, abs=0.02)
-                assert profile(placed, toward, np.radians(0.2)) == 1
+                assert (profile(placed, toward, np.radians(0.2)) == 1).all()
+
+
+@pytest.mark.parametrize("tall", [False, True])
+def test_an_image_on_a_light_lies_as_it_is_seen_and_keeps_the_flux(tall, tmp_path):
+    """Red at the left, blue at the right, darker below: larger azimuths are at the right."""
+    picture = np.zeros((40, 80, 3), np.float32)
+    picture[:, :40, 0], picture[:, 40:, 2] = 8, 2
+    picture[20:] *= 0.25
+    picture = picture.transpose(1, 0, 2)[::-1] if tall else picture  # to the left: red is below, dark right
+    images.write_exr(tmp_path / "softbox.exr", picture, panorama=False)
+    text = "[input]\n[[input.lights]]\nazimuth = 180\nelevation = 0\nflux = [1, 1, 1]\nsize = 30\n"
+    settings = config.loads(text + 'shape = "image"\nimage = "softbox.exr"', tmp_path)
+    (light,) = settings.input.lights
+    assert light["image"] == str(tmp_path / "softbox.exr")
+    found = add(np.zeros((180, 360, 3), np.float32), [light])
+    assert flux(found) @ LUMINANCE == pytest.approx(1, rel=1e-6)
+    inside = found.sum(axis=2) > 1e-3 * found.max()
+    sides = np.count_nonzero(inside[90]), np.count_nonzero(inside[:, 180])
+    assert sides == pytest.approx((30, 60) if tall else (60, 30), abs=1)
+    brighter = found[100, 173] if tall else found[85, 165]
+    darker = found[100, 187] if tall else found[95, 165]
+    assert brighter[0] == pytest.approx(4 * darker[0], rel=1e-5) and not brighter[2] > 1e-5 * brighter[0]
+    other = found[80, 173] if tall else found[85, 195]
+    assert other[2] == pytest.approx(brighter[0] / 4, rel=1e-5)
+    for height in (4, 32):
+        for size in (0.01, 90.0):
+            coarse = add(np.zeros((height, 2 * height, 3), np.float32), [light | {"size": size}])
+            assert flux(coarse) @ LUMINANCE == pytest.approx(1, rel=1e-5) and np.isfinite(coarse).all()
+
+
+def test_images_that_cannot_be_on_a_light_are_named(tmp_path):
+    light = {"azimuth": 0, "elevation": 0, "flux": [1, 1, 1]}
+    for keys in ({"shape": "image"}, {"image": "a.exr"}, {"shape": "disc", "image": "a.exr"}):
+        with pytest.raises(ConfigError, match=r'lights\[0\]: got one of shape = "image" and image = FILE'):
+            config.from_dict({"input": {"lights": [light | keys]}})
+    images.write_exr(tmp_path / "black.exr", np.zeros((4, 4, 3)), panorama=False)
+    for name, says in (("no.exr", "No such file"), ("black.exr", "black.exr: is black")):
+        entry = light | {"size": 5.0, "shape": "image", "image": str(tmp_path / name)}
+        with pytest.raises(InputError, match=says):
+            add(np.zeros((8, 16, 3), np.float32), [entry])
 
 
 def test_what_the_map_does_not_have_is_told(sky):

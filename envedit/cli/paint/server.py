@@ -22,7 +22,7 @@ from starlette.responses import FileResponse, PlainTextResponse, Response
 from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from envedit.cli.paint import maps_folder, project, protocol, thumbnails
+from envedit.cli.paint import project, protocol, taken_files, thumbnails
 from envedit.cli.paint.session import Tell
 from envedit.cli.paint.worker import Again, Worker
 from envedit.core import shipped
@@ -39,9 +39,9 @@ TYPES = {
     ".jpg": "image/jpeg",
 }
 MOST_CLIENTS = 8
-LARGEST_MAP = 1 << 30
-"""Bytes of a map that is dropped on the page."""
-_MAP_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_. -]{0,100}\.(exr|hdr|png|jpg|jpeg)", re.IGNORECASE)
+LARGEST_FILE = 1 << 30
+"""Bytes of a file that the page sends."""
+_IMAGE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_. -]{0,100}\.(exr|hdr|png|jpg|jpeg)", re.IGNORECASE)
 _SAFE = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
     "img-src 'self' data:; connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
@@ -187,6 +187,7 @@ class Server:
                 WebSocketRoute("/{token}/ws", self._socket),
                 Route("/{token}/result/{name}", self._result),
                 Route("/{token}/map/{name}", self._map, methods=["PUT"]),
+                Route("/{token}/image/{name}", self._image, methods=["PUT"]),
                 Route("/{token}/{name}", self._page),
             ],
             lifespan=lifespan,
@@ -199,6 +200,9 @@ class Server:
         host = request.headers.get("host", "")
         own = [origin.removeprefix("http://") for origin in self.origins]
         return host in own and hmac.compare_digest(request.path_params["token"].encode(), self.token.encode())
+
+    def _from_page(self, request):
+        return self._known(request) and request.headers.get("origin") in self.origins
 
     async def _page(self, request: Request) -> Response:
         if not self._known(request):
@@ -222,33 +226,44 @@ class Server:
         return FileResponse(file, headers=safe)
 
     async def _map(self, request: Request) -> Response:
-        if not self._known(request) or request.headers.get("origin") not in self.origins:
-            return PlainTextResponse("not from the page", 403, _SAFE)
-        if self.worker.session is not None:
+        if self._from_page(request) and self.worker.session is not None:
             return PlainTextResponse("a painting is open: maps are taken before that", 409, _SAFE)
+        answer = await self._taken(request, taken_files.MAPS)
+        if answer.status_code == 200:
+            self.hub.say(_start())
+            self.thumbnails.make([(bytes(answer.body).decode(), True)])
+        return answer
+
+    async def _image(self, request: Request) -> Response:
+        answer = await self._taken(request, taken_files.IMAGES)
+        if answer.status_code == 200:  # painted.toml lies elsewhere
+            return PlainTextResponse(str(Path.cwd() / bytes(answer.body).decode()), headers=_SAFE)
+        return answer
+
+    async def _taken(self, request, folder):
+        """Write a file that the page sends to a folder, and answer with its name."""
+        if not self._from_page(request):
+            return PlainTextResponse("not from the page", 403, _SAFE)
         name = request.path_params["name"]
-        if not _MAP_NAME.fullmatch(name):
+        if not _IMAGE_NAME.fullmatch(name):
             wanted = "expected a plain name that ends in .exr, .hdr, .png or .jpg"
             return PlainTextResponse(wanted, 400, _SAFE)
         part, size = None, 0
         try:
-            part = maps_folder.part(name)
+            part = taken_files.part(name, folder)
             with open(part, "xb") as file:
                 async for piece in request.stream():
                     size += len(piece)
-                    if size > LARGEST_MAP:
-                        return PlainTextResponse(f"more than {LARGEST_MAP} bytes", 413, _SAFE)
+                    if size > LARGEST_FILE:
+                        return PlainTextResponse(f"more than {LARGEST_FILE} bytes", 413, _SAFE)
                     file.write(piece)
-            name = maps_folder.place(part, name)
+            return PlainTextResponse(taken_files.place(part, name), headers=_SAFE)
         except (OSError, ClientDisconnect) as error:
             return PlainTextResponse(f"not written: {error}", 500, _SAFE)
         finally:
             with contextlib.suppress(OSError):
                 if part is not None:
                     part.unlink(missing_ok=True)
-        self.hub.say(_start())
-        self.thumbnails.make([(name, True)])
-        return PlainTextResponse(name, headers=_SAFE)
 
     async def _socket(self, socket: WebSocket) -> None:
         if not self._known(socket) or socket.headers.get("origin") not in self.origins:
@@ -300,7 +315,7 @@ async def _send(client, socket):
 
 def _start():
     """Return what the start page offers."""
-    folders = [Path.cwd(), Path.cwd() / maps_folder.MAPS]
+    folders = [Path.cwd(), Path.cwd() / taken_files.MAPS]
     return {
         "type": "start",
         "maps": [os.path.relpath(file) for file in thumbnails.maps(folders)],

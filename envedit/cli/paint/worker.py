@@ -10,7 +10,7 @@ import traceback
 from pathlib import Path
 
 from envedit.cli import run
-from envedit.cli.paint import maps_folder, project
+from envedit.cli.paint import project, taken_files
 from envedit.cli.paint.protocol import ApplyLook, Choose, Edit, Open, Pick, Save, Sky
 from envedit.cli.paint.session import Session, SupersededError, Tell
 from envedit.core.errors import EnveditError, InputError, unwrapped
@@ -132,16 +132,16 @@ class Worker(threading.Thread):
         plain = re.sub(r"[^\w-]", "_", Path(request.name).stem)
         name = f"{Path(given.source).stem}_{plain}.exr"
         try:
-            part = maps_folder.part(name)
+            part = taken_files.part(name)
             with contextlib.ExitStack() as stack:
                 stack.callback(part.unlink, missing_ok=True)
                 warnings = map_file.write(part, edited, given)
-                file = maps_folder.place(part, name)
+                file = taken_files.place(part, name)
         except OSError as error:
-            raise InputError(f"{maps_folder.MAPS}/{name}: not written: {error.strerror}") from None
+            raise InputError(f"{taken_files.MAPS}/{name}: not written: {error.strerror}") from None
         self._open(project.on_another_map(session.project, session.document, file))
         said = [f"The map has the light of {request.name}: {file}", *warnings]
-        self.tell.say({"type": "told", "text": ". ".join(said)})
+        self.tell.say({"type": "note", "text": ". ".join(said)})
 
     def _open(self, opened):
         """Open a painting in the place of the one that is open, which stays if that fails."""

@@ -14,10 +14,11 @@ import numpy as np
 from envedit.config import light_schema
 from envedit.core import latlong
 from envedit.core.arrays import tensor
+from envedit.core.color import LUMINANCE
 from envedit.core.radiance import BRIGHTEST, require_radiance
 from envedit.core.rotations import rotation_vector
 from envedit.images import map_regions
-from envedit.representations.layers import below_horizon
+from envedit.representations.layers import below_horizon, light_images
 from envedit.representations.layers.layers import Layers
 from envedit.representations.layers.lights import DARK
 from envedit.representations.layers.unseen import unseen_kept
@@ -147,8 +148,8 @@ def missing(placed: Sequence[dict], count: int) -> list[int]:
 def add(envmap: np.ndarray, added: Sequence[dict]) -> np.ndarray:
     """Add lights to a map (H, W, 3) of any resolution.
 
-    A light's radiance is flux g / sum(g omega), with g its :func:`profile` and omega the solid angles by
-    which Mitsuba looks texels up.
+    A light's radiance is flux g / sum(Y(g) omega), with g its :func:`profile`, Y luminance and omega the
+    solid angles by which Mitsuba looks texels up. InputError if an image of one cannot be used.
     """
     if not added:
         return envmap
@@ -162,15 +163,16 @@ def add(envmap: np.ndarray, added: Sequence[dict]) -> np.ndarray:
         near = np.flatnonzero(np.abs(elevations - light["elevation"]) < reach)
         bands = [slice(row, min(row + ROWS, near[-1] + 1)) for row in range(near[0], near[-1] + 1, ROWS)]
         shapes = [profile(light, latlong.directions(height, width, band), texel) for band in bands]
-        total = sum(float((shape * omega[band]).sum()) for shape, band in zip(shapes, bands, strict=True))
+        parts = [(shape @ LUMINANCE) * omega[band] for shape, band in zip(shapes, bands, strict=True)]
+        total = float(sum(part.sum() for part in parts))
         for shape, band in zip(shapes, bands, strict=True):
             with np.errstate(over="ignore"):
-                radiance[band] += (shape[..., None] * (flux_of(light) / total)).astype(np.float32)
+                radiance[band] += (shape * (flux_of(light) / total)).astype(np.float32)
     return radiance
 
 
 def profile(light: dict, toward: np.ndarray, texel: float) -> np.ndarray:
-    """Return the radiance of an added light, 1 at its brightest, in directions (..., 3) of the map.
+    """Return the radiance of an added light, its luminance 1 at its brightest, in directions (..., 3).
 
     Shapes lie in the azimuthal equidistant projection around the light's direction, x to larger azimuths and
     y up, both turned by ``rotation``: a disc of 90 degrees is a half dome. With a = ``size`` half of the
@@ -179,14 +181,16 @@ def profile(light: dict, toward: np.ndarray, texel: float) -> np.ndarray:
         g = 3 t^2 - 2 t^3,    t = clip(1/2 + d / max(2 softness c, texel), 0, 1),
 
     where c is the largest d. A "rectangle" is the product of such g across both pairs of sides, a "gradient"
-    the rectangle times a ramp along y, a "gaussian" exp(-(x/a)^2 / 2 - (y/b)^2 / 2).
+    the rectangle times a ramp along y, a "gaussian" exp(-(x/a)^2 / 2 - (y/b)^2 / 2), an "image" the rectangle
+    of the image's sides times the image (:func:`.light_images.sampled`).
 
-    ``light`` is without the key ``light``, as of :func:`.light_schema.LightList`; ``toward`` are unit vectors
-    in the frame of the map, and ``texel`` is the spacing of the texels in radians: the least width of a
-    border, and about the least of a light.
+    Returns (..., 3). ``light`` is without the key ``light``, as of :func:`.light_schema.LightList`;
+    ``toward`` are unit vectors in the frame of the map, and ``texel`` is the spacing of the texels in
+    radians: the least width of a border, and about the least of a light.
     """
     shape = light.get("shape", "gaussian")
-    aspect = light.get("aspect", light_schema.SHAPES[shape])
+    wide, high = light_images.shares(light["image"]) if shape == "image" else (1.0, 1.0)
+    aspect = light.get("aspect", light_schema.SHAPES[shape] or min(wide, high))
 
     # ---- Coordinates in radians along the sides
     azimuth, rotation = np.radians([light["azimuth"], light.get("rotation", 0)])
@@ -198,17 +202,18 @@ def profile(light: dict, toward: np.ndarray, texel: float) -> np.ndarray:
     sine = np.hypot(across, along)
     stretch = np.arctan2(sine, toward @ centre) / np.maximum(sine, 1e-12)
     x, y = stretch * across, stretch * along
-    a, b = (np.radians(light["size"]) * part for part in (1.0, aspect))
+    sides = (1.0, aspect) if wide >= high else (aspect, 1.0)
+    a, b = (np.radians(light["size"]) * part for part in sides)
 
     # ---- The Gaussian has no border
     if shape == "gaussian":
         least = ADDED_LEAST_TEXELS * texel
         radius = np.hypot(x / max(a, least), y / max(b, least))
-        return np.where(radius < GAUSSIAN_REACH, np.exp(-0.5 * radius**2), 0.0)
+        return _grey(np.where(radius < GAUSSIAN_REACH, np.exp(-0.5 * radius**2), 0.0))
 
     # ---- The others have one as wide as asked for, and no narrower than a texel
     a, b = max(a, texel / 2), max(b, texel / 2)
-    middle = b / 4 if shape == "ring" else b
+    middle = b / 4 if shape == "ring" else min(a, b)
 
     def inside(distance):
         t = np.clip(0.5 + distance / max(2 * light.get("softness", 0) * middle, texel), 0, 1)
@@ -219,11 +224,19 @@ def profile(light: dict, toward: np.ndarray, texel: float) -> np.ndarray:
         slope = np.hypot(x / a**2, y / b**2)
         unit = np.where(radius > 0, radius / np.maximum(slope, 1e-12), b)  # of the radius, in radians
         hole = (radius - 0.5) * unit if shape == "ring" else np.inf
-        return inside(np.minimum((1 - radius) * unit, hole))
+        return _grey(inside(np.minimum((1 - radius) * unit, hole)))
     if shape == "strip":
-        return inside(b - np.hypot(np.maximum(np.abs(x) - (a - b), 0), y))
-    rectangle = inside(a - np.abs(x)) * inside(b - np.abs(y))
-    return rectangle * np.clip(0.5 + 0.5 * y / b, 0, 1) if shape == "gradient" else rectangle
+        return _grey(inside(b - np.hypot(np.maximum(np.abs(x) - (a - b), 0), y)))
+    rectangle = _grey(inside(a - np.abs(x)) * inside(b - np.abs(y)))
+    if shape == "image":
+        u, v = 0.5 + 0.5 * x / a, 0.5 - 0.5 * y / b
+        return rectangle * light_images.sampled(light["image"], u, v, texel / (2 * max(a, b)))
+    return rectangle * _grey(np.clip(0.5 + 0.5 * y / b, 0, 1)) if shape == "gradient" else rectangle
+
+
+def _grey(values):
+    """Give values (...) three channels that are the same."""
+    return np.repeat(values[..., None], 3, axis=-1)
 
 
 def direction(azimuth: float, elevation: float) -> np.ndarray:

@@ -185,7 +185,7 @@ export class Lights {
     let next = { [what]: Number(this.panel[what].value) }; // aspect, rotation, softness
     if (what === "flux") next = { flux: tint.map((v) => Math.min(1e6, (v / most) * strength)) };
     if (what === "size") next = { size: Math.min(mostSize(light), round(2 ** Number(size.value))) };
-    if (what === "shape") next = { shape: this.panel.shape.value, aspect: aspectOf(this.panel.shape.value) };
+    if (what === "shape") next = { shape: this.panel.shape.value, aspect: aspectOf(this.panel.shape.value), image: undefined };
     this.preview(this.chosen, next);
   }
 

@@ -226,7 +226,7 @@ const RECEIVED = {
     const links = message.files.filter((name) => ["report.html", "edited.exr", "edited_full.exr", "edited_full.hdr", "lights.json", "look.toml"].includes(name));
     $("message").replaceChildren(`Saved in ${message.folder}: `, ...links.flatMap((name) => [Object.assign(document.createElement("a"), { href: `result/${name}`, textContent: name, target: "_blank" }), " "]), ...[...message.notes, ...message.warnings].map((line) => `${line}. `));
   },
-  told(message) { say(message.text, true); },
+  note(message) { say(message.text, true); },
   refused(message) { say(message.text); },
   error(message) { $("progress").hidden = true; say(message.text); state("error", "Error"); },
 };
@@ -509,6 +509,19 @@ for (const [id, key] of [...ORIENTATION, ["map-exposure", "exposure"], ["map-tem
   });
 }
 
+async function put(kind, file) {
+  const answer = await fetch(`${kind}/${encodeURIComponent(file.name)}`, { method: "PUT", body: file });
+  return [answer.ok, await answer.text()];
+}
+$("light-image").addEventListener("click", () => $("light-image-file").click());
+$("light-image-file").addEventListener("change", async () => {
+  const [file] = $("light-image-file").files, index = lights.chosen;
+  $("light-image-file").value = ""; // the same file may be chosen again
+  if (!file) return;
+  const [taken, text] = await put("image", file);
+  if (taken) lights.edit(index, { shape: "image", image: text, aspect: undefined });
+  else say(text);
+});
 $("look").addEventListener("click", () => $("look-file").click());
 $("look-file").addEventListener("change", async () => {
   const [file] = $("look-file").files;
@@ -588,9 +601,8 @@ $("open").addEventListener("submit", (event) => { event.preventDefault(); open($
 
 async function upload(file) {
   state("loading", `Taking ${file.name}`);
-  const answer = await fetch(`map/${encodeURIComponent(file.name)}`, { method: "PUT", body: file });
-  const text = await answer.text();
-  if (!answer.ok) { say(text); state("ready", "Choose what to paint on"); return; }
+  const [taken, text] = await put("map", file);
+  if (!taken) { say(text); state("ready", "Choose what to paint on"); return; }
   chooser.choose(text);
   $("open-name").value ||= "sphere";
   state("ready", "Choose what to paint on");

@@ -1,0 +1,85 @@
+"""Images on lights that are added (``[[input.lights]] image``): a window, a softbox, a sky of another map."""
+
+from __future__ import annotations
+
+import functools
+import math
+import os
+
+import numpy as np
+
+from envedit.core import resampling
+from envedit.core.color import LUMINANCE
+from envedit.core.errors import InputError
+from envedit.core.radiance import BRIGHTEST, require_radiance
+from envedit.images import images
+
+MOST_PIXELS = 1024
+"""Pixels of the longer side that are kept: of a light half a sphere wide they are 0.18 degrees."""
+
+DARKEST = np.float32(1e-6)
+"""Least radiance over the image's brightest: a light of few texels, in its dark part, keeps its flux."""
+
+
+def shares(path: str) -> tuple[float, float]:
+    """Return the width and the height of an image over the longer of them; errors as of :func:`sampled`."""
+    height, width = _levels(path)[0].shape[:2]
+    return width / max(width, height), height / max(width, height)
+
+
+def sampled(path: str, u: np.ndarray, v: np.ndarray, spacing: float) -> np.ndarray:
+    """Interpolate an image at places, from averages of as many pixels as lie between two of them.
+
+    Parameters
+    ----------
+    path : str
+        Of a file that :func:`.images.read` reads.
+    u, v : ndarray (...)
+        Shares of its width from the left and of its height from the top; beyond its border it goes on.
+    spacing : float
+        Of the places, as a share of the longer side.
+
+    Returns
+    -------
+    ndarray (..., 3) float32
+        Linear radiance over the image's largest luminance.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read, is black, or has a value that is no radiance.
+    """
+    levels = _levels(path)
+    pixels = max(levels[0].shape[:2])
+    level = levels[min(max(math.ceil(math.log2(max(spacing * pixels, 1))), 0), len(levels) - 1)]
+    height, width, _ = level.shape
+    x, y = np.clip(u * width - 0.5, 0, width - 1), np.clip(v * height - 0.5, 0, height - 1)
+    left, top = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
+    right, down = np.minimum(left + 1, width - 1), np.minimum(top + 1, height - 1)
+    x, y = (x - left)[..., None], (y - top)[..., None]
+    above = (1 - x) * level[top, left] + x * level[top, right]
+    below = (1 - x) * level[down, left] + x * level[down, right]
+    return ((1 - y) * above + y * below).astype(np.float32)
+
+
+def _levels(path):
+    """Return an image at full, half, quarter size ..., to one pixel."""
+    try:
+        return _read(path, os.stat(path).st_mtime_ns)
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror or error}") from None
+
+
+@functools.lru_cache(maxsize=8)
+def _read(path, _changed):
+    image, _ = images.read(path)
+    require_radiance(image, path, brightest=BRIGHTEST)
+    shrink = max(1.0, max(image.shape[:2]) / MOST_PIXELS)
+    image = resampling.fit(image, *(max(1, round(side / shrink)) for side in image.shape[:2]))
+    brightest = float((image @ np.array(LUMINANCE, np.float32)).max())
+    if not brightest > 0:
+        raise InputError(f"{path}: is black: a light with it has no colour")
+    levels = [np.maximum(image / np.float32(brightest), DARKEST)]
+    while max(levels[-1].shape[:2]) > 1:
+        levels.append(resampling.fit(levels[-1], *((side + 1) // 2 for side in levels[-1].shape[:2])))
+    return levels

@@ -233,6 +233,19 @@ def test_a_shadow_is_dragged_and_what_goes_along_is_chosen(browser, tmp_path):
         assert not page.faults, page.faults
 
 
+def an_image_is_put_on_the_light(page, lights, folder):
+    """The file goes to a folder of the working folder, and the light has the image's sides."""
+    softbox = folder / "softbox.png"
+    images.write_png(softbox, np.linspace(0, 1, 24).reshape(2, 4, 3))
+    page.page.get_by_test_id("light-image-file").set_input_files(softbox)
+    until(lambda: lights()[0]["shape"] == "image" and "aspect" not in lights()[0])
+    taken = folder / "images" / "softbox.png"
+    assert lights()[0]["image"] == str(taken) and taken.read_bytes() == softbox.read_bytes()
+    page.shot("image")
+    page.page.get_by_test_id("undo").click()
+    until(lambda: lights()[0]["shape"] == "strip")
+
+
 def test_lights_are_placed_by_clicks_and_shaped(browser, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "edit.toml").write_text(SMALL)
@@ -264,15 +277,7 @@ def test_lights_are_placed_by_clicks_and_shaped(browser, tmp_path, monkeypatch):
             control.select_option(value) if key == "shape" else control.fill(value)
             until(lambda key=key, value=value: str(lights()[0].get(key)) in (value, f"{value}.0"))
         page.shot("shaped")
-        softbox = tmp_path / "softbox.png"
-        images.write_png(softbox, np.linspace(0, 1, 24).reshape(2, 4, 3))
-        page.page.get_by_test_id("light-image-file").set_input_files(softbox)
-        until(lambda: lights()[0]["shape"] == "image" and "aspect" not in lights()[0])
-        assert (tmp_path / "images" / "softbox.png").read_bytes() == softbox.read_bytes()
-        assert lights()[0]["image"] == str(tmp_path / "images" / "softbox.png")
-        page.shot("image")
-        page.page.get_by_test_id("undo").click()
-        until(lambda: lights()[0]["shape"] == "strip")
+        an_image_is_put_on_the_light(page, lights, tmp_path)
         page.page.get_by_test_id("undo").click()
         until(lambda: lights()[0]["aspect"] == 0.1)
         # ---- Its size and flux, by drags of its handle with a key: it stays where it is

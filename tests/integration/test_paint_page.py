@@ -233,6 +233,44 @@ def test_a_shadow_is_dragged_and_what_goes_along_is_chosen(browser, tmp_path):
         assert not page.faults, page.faults
 
 
+def size_and_flux_are_dragged(page, lights):
+    """By drags of its handle with a key: it stays where it is."""
+    stays = {key: lights()[0][key] for key in ("azimuth", "elevation")}
+    handle = page.page.get_by_test_id("handle-2").bounding_box()
+    x, y = handle["x"] + handle["width"] / 2, handle["y"] + handle["height"] / 2
+    for key, name, factor in (("Shift", "size", 2), ("Control", "flux", 0.5)):
+        before = np.array(lights()[0][name])
+        page.page.keyboard.down(key)
+        page.drag((x, y), (x, y + (50 if factor < 1 else -50)))
+        page.page.keyboard.up(key)
+        until(lambda name=name, wanted=factor * before: np.allclose(lights()[0][name], wanted, rtol=0.05))
+    assert {key: lights()[0][key] for key in stays} == stays
+
+
+def a_highlight_is_dragged(page, lights):
+    """The light that makes it follows: whichever of them adds most there."""
+    before = [light.get("azimuth") for light in lights()]
+    page.page.keyboard.press("8")
+    page.drag(page.at("#overlay", 0.4, 0.45), page.at("#overlay", 0.55, 0.4))
+    until(lambda: [light.get("azimuth") for light in lights()] != before)
+
+
+def each_kind_of_stroke_is_painted(page, kept):
+    """By its button, with a slider of its own where it has one."""
+    sliders = {"light": "amount", "contrast": "amount", "temperature": "kelvin", "blur": "radius"}
+    tools = ["light", "shadow", "erase-shadow", "temperature", "contrast", "blur", "hold"]
+    for count, tool in enumerate(tools, 1):
+        page.page.get_by_test_id(f"tool-{tool}").click()
+        page.page.get_by_test_id("shape-rectangle").click()
+        if tool in sliders:
+            page.page.get_by_test_id(sliders[tool]).press("ArrowRight")
+        page.drag(page.at("#overlay", 0.2, 0.2), page.at("#overlay", 0.3, 0.3))
+        until(lambda count=count: kept.read_text().count("[[target.strokes]]") == count)
+        stroke = config.load(kept).target.strokes[-1]
+        assert stroke["type"] == tool and stroke["rectangle"] == pytest.approx([0.2, 0.2, 0.3, 0.3], abs=0.01)
+        assert tool not in sliders or stroke[sliders[tool]] > 0
+
+
 def an_image_is_put_on_the_light(page, lights, folder):
     """The file goes to a folder of the working folder, and the light has the image's sides."""
     softbox = folder / "softbox.png"
@@ -280,17 +318,7 @@ def test_lights_are_placed_by_clicks_and_shaped(browser, tmp_path, monkeypatch):
         an_image_is_put_on_the_light(page, lights, tmp_path)
         page.page.get_by_test_id("undo").click()
         until(lambda: lights()[0]["aspect"] == 0.1)
-        # ---- Its size and flux, by drags of its handle with a key: it stays where it is
-        stays = {key: lights()[0][key] for key in ("azimuth", "elevation")}
-        handle = page.page.get_by_test_id("handle-2").bounding_box()
-        x, y = handle["x"] + handle["width"] / 2, handle["y"] + handle["height"] / 2
-        for key, name, factor in (("Shift", "size", 2), ("Control", "flux", 0.5)):
-            before = np.array(lights()[0][name])
-            page.page.keyboard.down(key)
-            page.drag((x, y), (x, y + (50 if factor < 1 else -50)))
-            page.page.keyboard.up(key)
-            until(lambda name=name, wanted=factor * before: np.allclose(lights()[0][name], wanted, rtol=0.05))
-        assert {key: lights()[0][key] for key in stays} == stays
+        size_and_flux_are_dragged(page, lights)
         # ---- Without a chosen light, the sun casts the shadow
         page.page.keyboard.press("Escape")
         sync_api.expect(page.page.get_by_test_id("light-panel")).to_contain_text("No light chosen")
@@ -302,6 +330,8 @@ def test_lights_are_placed_by_clicks_and_shaped(browser, tmp_path, monkeypatch):
         page.page.keyboard.press("w")
         page.page.mouse.click(*page.at("#overlay", 0.3, 0.8))
         sync_api.expect(message).to_contain_text(re.compile("Light of this place: .*rest of the map"))
+        a_highlight_is_dragged(page, lights)
+        each_kind_of_stroke_is_painted(page, kept)
         page.settled(False)
         page.shot("placed")
 

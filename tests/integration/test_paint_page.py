@@ -331,9 +331,9 @@ def test_lights_are_placed_by_clicks_and_shaped(browser, tmp_path, monkeypatch):
         page.page.mouse.click(*page.at("#overlay", 0.3, 0.8))
         sync_api.expect(message).to_contain_text(re.compile("Light of this place: .*rest of the map"))
         a_highlight_is_dragged(page, lights)
-        each_kind_of_stroke_is_painted(page, kept)
         page.settled(False)
         page.shot("placed")
+        each_kind_of_stroke_is_painted(page, kept)
 
 
 def lights_are_listed(page, kept):

@@ -17,7 +17,7 @@ from envedit.config.validators import (
     Numbers,
     Schema,
     String,
-    WantedError,
+    Tables,
     meant,
     named,
     show,
@@ -91,21 +91,14 @@ SIZE = 0.5
 
 
 @dataclass(frozen=True)
-class LightList(Check):
-    """A list of lights; every entry has all keys that it can have.
+class LightList(Tables):
+    """A list of lights; every entry has all keys that it can have."""
 
-    Calling it raises ConfigError, which names ``input.lights[2].flux``, where an entry has an unknown key or
-    an unusable value; WantedError if it is no list of tables, or too long.
-    """
-
-    kind = "list of tables"
+    name = "input.lights"
+    most = MOST_PLACED
 
     def _take(self, value: Any) -> tuple[dict[str, Any], ...]:
-        if not isinstance(value, list | tuple) or not all(isinstance(v, dict) for v in value):
-            raise WantedError(str(self))
-        if len(value) > MOST_PLACED:
-            raise WantedError(f"at most {MOST_PLACED} lights")
-        found = tuple(_light(f"input.lights[{i}]", v) for i, v in enumerate(value))
+        found = super()._take(value)
         own = [light["light"] for light in found if "light" in light]
         if twice := sorted({n for n in own if own.count(n) > 1}):
             raise ConfigError(
@@ -113,19 +106,13 @@ class LightList(Check):
             )
         return found
 
-    def __str__(self) -> str:
-        return "a list of tables"
-
-    @property
-    def range(self) -> str:
-        """How many."""
-        return f"at most {MOST_PLACED}"
+    def _entry(self, name: str, table: dict[str, Any]) -> dict[str, Any]:
+        return _light(name, table)
 
     def _schema(self) -> Schema:
         keys = {key: {**(OWN | ADDED)[key].schema(), "description": MEANINGS[key]} for key in MEANINGS}
-        light: Schema = {"type": "object", "properties": keys, "additionalProperties": False}
-        light["dependencies"] = {"azimuth": ["elevation"], "elevation": ["azimuth"]}
-        return {"type": "array", "items": light, "maxItems": MOST_PLACED}
+        both = {"azimuth": ["elevation"], "elevation": ["azimuth"]}
+        return self._schema_of({"properties": keys, "dependencies": both})
 
 
 def _light(name: str, light: dict[str, Any]) -> dict[str, Any]:

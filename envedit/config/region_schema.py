@@ -8,7 +8,18 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from envedit.config.validators import Check, Choice, Number, Numbers, Schema, WantedError, meant, named, show
+from envedit.config.validators import (
+    Check,
+    Choice,
+    Number,
+    Numbers,
+    Schema,
+    Tables,
+    WantedError,
+    meant,
+    named,
+    show,
+)
 from envedit.core.errors import ConfigError
 
 MOST_REGIONS, MOST_POINTS = 64, 500
@@ -69,36 +80,21 @@ MEANINGS = {
 
 
 @dataclass(frozen=True)
-class RegionList(Check):
-    """A list of regions.
+class RegionList(Tables):
+    """A list of regions."""
 
-    Calling it raises ConfigError, which names ``input.regions[2].radius``, where an entry has an unknown key
-    or an unusable value; WantedError if it is no list of tables, or too long.
-    """
+    name = "input.regions"
+    most = MOST_REGIONS
 
-    kind = "list of tables"
-
-    def _take(self, value: Any) -> tuple[dict[str, Any], ...]:
-        if not isinstance(value, list | tuple) or not all(isinstance(v, dict) for v in value):
-            raise WantedError(str(self))
-        if len(value) > MOST_REGIONS:
-            raise WantedError(f"at most {MOST_REGIONS} regions")
-        return tuple(_region(f"input.regions[{i}]", v) for i, v in enumerate(value))
-
-    def __str__(self) -> str:
-        return "a list of tables"
-
-    @property
-    def range(self) -> str:
-        """How many."""
-        return f"at most {MOST_REGIONS}"
+    def _entry(self, name: str, table: dict[str, Any]) -> dict[str, Any]:
+        return _region(name, table)
 
     def _schema(self) -> Schema:
         keys = {key: {**check.schema(), "description": MEANINGS[key]} for key, check in KEYS.items()}
-        region: Schema = {"type": "object", "properties": keys, "additionalProperties": False}
-        region |= {"required": ["action"], "oneOf": [{"required": ["points"]}, {"required": ["polygon"]}]}
-        region["dependencies"] = {"points": ["radius"], "radius": ["points"]}
-        return {"type": "array", "items": region, "maxItems": MOST_REGIONS}
+        shape = [{"required": ["points"]}, {"required": ["polygon"]}]
+        brush = {"points": ["radius"], "radius": ["points"]}
+        region = {"properties": keys, "required": ["action"], "oneOf": shape, "dependencies": brush}
+        return self._schema_of(region)
 
 
 def _region(name: str, region: dict[str, Any]) -> dict[str, Any]:

@@ -12,7 +12,18 @@ from typing import Any
 import numpy as np
 
 from envedit.config.key_validators import View
-from envedit.config.validators import Check, Choice, Number, Numbers, Schema, WantedError, meant, named, show
+from envedit.config.validators import (
+    Check,
+    Choice,
+    Number,
+    Numbers,
+    Schema,
+    Tables,
+    WantedError,
+    meant,
+    named,
+    show,
+)
 from envedit.core.color import srgb_to_linear
 from envedit.core.errors import ConfigError
 
@@ -162,22 +173,13 @@ MEANINGS = {
 
 
 @dataclass(frozen=True)
-class StrokeList(Check):
-    """A list of strokes, each with all of its keys spelled out; see :mod:`envedit.targets.strokes`.
+class StrokeList(Tables):
+    """A list of strokes, each with all of its keys spelled out; see :mod:`envedit.targets.strokes`."""
 
-    Calling it raises ConfigError, which names ``target.strokes[2].width``, where a stroke has an unknown key
-    or an unusable value; WantedError if it is no list of tables.
-    """
+    name = "target.strokes"
 
-    kind = "list of tables"
-
-    def _take(self, value: Any) -> tuple[dict[str, Any], ...]:
-        if not isinstance(value, list | tuple) or not all(isinstance(v, dict) for v in value):
-            raise WantedError(str(self))
-        return tuple(_stroke(f"target.strokes[{i}]", v) for i, v in enumerate(value))
-
-    def __str__(self) -> str:
-        return "a list of tables"
+    def _entry(self, name: str, table: dict[str, Any]) -> dict[str, Any]:
+        return _stroke(name, table)
 
     def _schema(self) -> Schema:
         properties: Schema = {}
@@ -185,8 +187,7 @@ class StrokeList(Check):
             each = [check.schema() for check in dict.fromkeys(checks)]
             properties[key] = each[0] if len(each) == 1 else {"anyOf": each}
             properties[key] = {**properties[key], "description": MEANINGS[key]}
-        stroke = {"type": "object", "properties": properties, "required": ["type"]}
-        return {"type": "array", "items": stroke | {"additionalProperties": False}}
+        return self._schema_of({"properties": properties, "required": ["type"]})
 
 
 def stroke_keys() -> dict[str, list[Check]]:

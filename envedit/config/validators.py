@@ -63,6 +63,41 @@ class Check(ABC):
     def _schema(self) -> Schema: ...
 
 
+class Tables(Check):
+    """A list of tables.
+
+    Calling it raises ConfigError, which names ``input.lights[2].flux``, where an entry has an unknown key or
+    an unusable value; WantedError if it is no list of tables, or too long.
+    """
+
+    kind = "list of tables"
+    name: str  # of the key, "input.lights"
+    most: int | None = None  # entries; None: any number
+
+    def _take(self, value: Any) -> tuple[dict[str, Any], ...]:
+        if not isinstance(value, list | tuple) or not all(isinstance(v, dict) for v in value):
+            raise WantedError(str(self))
+        if self.most is not None and len(value) > self.most:
+            raise WantedError(f"{self.range} {self.name.split('.')[1]}")
+        return tuple(self._entry(f"{self.name}[{i}]", v) for i, v in enumerate(value))
+
+    @abstractmethod
+    def _entry(self, name: str, table: dict[str, Any]) -> dict[str, Any]: ...
+
+    def __str__(self) -> str:
+        return "a list of tables"
+
+    @property
+    def range(self) -> str:
+        """How many."""
+        return "" if self.most is None else f"at most {self.most}"
+
+    def _schema_of(self, table: Schema) -> Schema:
+        """Return that of the list, given what entries have beside being tables of these properties."""
+        entry = {"type": "object", **table, "additionalProperties": False}
+        return {"type": "array", "items": entry} | ({} if self.most is None else {"maxItems": self.most})
+
+
 # ---- words -------------------------------------------------------------------------------------------------
 
 

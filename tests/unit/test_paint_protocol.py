@@ -31,8 +31,8 @@ def message(**more):
     [
         ("", "expected JSON"),
         ("[" * 5000, "expected JSON"),
-        ("[]", "expected document, pick, choose, open, sky or save"),
-        ('{"type": "run"}', "expected document, pick, choose, open, sky or save"),
+        ("[]", "expected document, pick, choose, open, look, sky or save"),
+        ('{"type": "run"}', "expected document, pick, choose, open, look, sky or save"),
         (b"\x00\x01", "expected JSON text"),
         (" " * (protocol.MOST_BYTES + 1), "at most"),
         (message(document=3), "expected keys among"),

@@ -99,7 +99,7 @@ class Worker(threading.Thread):
 
     def _carry_out(self, request):
         if isinstance(request, Open):
-            self._open(project.opened(request.name, request.envmap))
+            self._open_next(project.opened(request.name, request.envmap))
         elif self.session is None:
             if not isinstance(request, Again):
                 self.tell.say({"type": "error", "text": "no scene is open: open one first"})
@@ -139,9 +139,17 @@ class Worker(threading.Thread):
                 file = taken_files.place(part, name)
         except OSError as error:
             raise InputError(f"{taken_files.MAPS}/{name}: not written: {error.strerror}") from None
-        self._open(project.on_another_map(session.project, session.document, file))
+        self._open_next(project.on_another_map(session.project, session.document, file))
         said = [f"The map has the light of {request.name}: {file}", *warnings]
         self.tell.say({"type": "note", "text": ". ".join(said)})
+
+    def _open_next(self, opened):
+        before = self.session
+        self._open(opened)
+        if before is not None:
+            with self._lock:  # what came meanwhile is about what was open before
+                for kind in (Edit, Pick, Choose, Sky, Save):
+                    self._waiting.pop(kind, None)
 
     def _open(self, opened):
         """Open a painting in the place of the one that is open, which stays if that fails."""
@@ -167,10 +175,6 @@ class Worker(threading.Thread):
                 mi.set_variant(variant)
             raise
         self.session = session
-        if before is not None:
-            with self._lock:  # what came meanwhile is about what was open before
-                for kind in (Edit, Pick, Choose, Sky, Save):
-                    self._waiting.pop(kind, None)
         self._painting += 1
         project.note(opened)
         scene = run.scene_name(self.session.scene.path)

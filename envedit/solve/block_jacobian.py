@@ -97,21 +97,18 @@ class BlockJacobian:
         size = np.maximum(self._total[self._used[cells]], 1e-30)
         return [tensor(m[:, cells] / np.float32(size)) for m in self._matrix]
 
-    def of_cells(self, flux: np.ndarray) -> list[mi.TensorXf]:
-        """Return pictures in blocks of a flux (3,) in each cell of :attr:`sky`, (blocks, n) per channel."""
-        return [m * flat(mi.Float, np.float32(f)) for m, f in zip(self._lit, flux, strict=True)]
+    def cells(self, ground: np.ndarray | None = None) -> CellLights:
+        """Return pictures of light in each cell of :attr:`sky`.
 
-    def products(self, pictures: list[np.ndarray]) -> list[np.ndarray]:
-        """Return, per channel, products of pictures (blocks, k) with those of :attr:`sky`'s cells: (k, n).
-
-        The latter are of a flux of 1.
+        ``ground`` (h, w, 3) is the picture of ground on which light of an irradiance of 1 falls; None: none.
         """
-        return [dr.matmul(tensor(p), m, At=True).numpy() for m, p in zip(self._lit, pictures, strict=True)]
-
-    def power(self, weights: np.ndarray) -> np.ndarray:
-        """Return sums of weights (blocks, 3) times the squared pictures of those cells, (3, n)."""
-        squares = zip(self._lit, weights.T, strict=True)
-        return np.stack([dr.matmul(tensor(w[None]), dr.square(m)).numpy()[0] for m, w in squares])
+        if ground is None:
+            return CellLights(self._lit)
+        _, directions = self.sky
+        upward = np.maximum(directions[:, 1], 0)
+        size = np.maximum(np.bincount(self.block_of, minlength=self.count), 1)[:, None]
+        by_blocks = [tensor(np.outer(of_channel, upward)) for of_channel in (self.summed(ground) / size).T]
+        return CellLights([lit + lit_ground for lit, lit_ground in zip(self._lit, by_blocks, strict=True)])
 
     def spread(self, covariance: np.ndarray) -> np.ndarray:
         """Return the standard deviation of the sum of all grids in every texel, (rows, W)."""
@@ -129,3 +126,23 @@ class BlockJacobian:
         in_blocks = np.zeros((len(pictures), self.count), pictures.dtype)
         in_blocks[:, self._present] = np.add.reduceat(pictures[:, self._order], self._starts, axis=1)
         return in_blocks
+
+
+class CellLights:
+    """Pictures in blocks, (blocks, n) per channel, of a flux of 1 in each cell of the sky."""
+
+    def __init__(self, lit: list[mi.TensorXf]):
+        self._lit = lit
+
+    def of(self, flux: np.ndarray) -> list[mi.TensorXf]:
+        """Return those of a flux (3,)."""
+        return [m * flat(mi.Float, np.float32(f)) for m, f in zip(self._lit, flux, strict=True)]
+
+    def products(self, pictures: list[np.ndarray]) -> list[np.ndarray]:
+        """Return, per channel, products of pictures (blocks, k) with them: (k, n)."""
+        return [dr.matmul(tensor(p), m, At=True).numpy() for m, p in zip(self._lit, pictures, strict=True)]
+
+    def power(self, weights: np.ndarray) -> np.ndarray:
+        """Return sums of weights (blocks, 3) times their squares, (3, n)."""
+        squares = zip(self._lit, weights.T, strict=True)
+        return np.stack([dr.matmul(tensor(w[None]), dr.square(m)).numpy()[0] for m, w in squares])

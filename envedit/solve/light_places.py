@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from envedit.core import latlong
+from envedit.core.arrays import tensor
 from envedit.representations.layers.lights import FAINTEST
 from envedit.solve.map_problem import Point, Problem
 from envedit.solve.normal_equations import Normal, forward
@@ -40,12 +41,35 @@ class Place:
     fall: float
 
 
+def lit_ground(problem: Problem, point: Point) -> np.ndarray | None:
+    """Return the picture (h, w, 3) of the map's ground under light of an irradiance of 1; None of none.
+
+    At a point, whose ground has so much radiance under so much light.
+    """
+    layers, light = problem.layers, problem.layers.ground_light
+    if light is None:
+        return None
+    up = layers.shape[0]
+    irradiance = light.irradiance(point.edited[problem.rows][:up])
+    ground = np.zeros_like(point.edited)
+    ground[problem.rows] = point.sky * layers.lit[:, None, None] / np.maximum(irradiance, 1e-30)
+    picture = problem.transport.linear(tensor(ground)).numpy()
+    return picture if picture.any() else None
+
+
 def probed(
-    problem: Problem, row: int, column: int, flux: np.ndarray, spacing: int, reach: int
+    problem: Problem,
+    row: int,
+    column: int,
+    flux: np.ndarray,
+    spacing: int,
+    reach: int,
+    ground: np.ndarray | None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return texels (n,) of the sky around one, and pictures (n, pixels, 3) of a flux (3,) in each.
 
-    They are so many texels apart, ``reach`` of them to each side; the pictures are of exact columns.
+    They are so many texels apart, ``reach`` of them to each side; the pictures are of exact columns, and of
+    the ``ground`` that is lit (:func:`lit_ground`).
     """
     height, width = problem.envmap.shape[:2]
     first = problem.rows.start
@@ -54,7 +78,11 @@ def probed(
     texels = (rows[:, None] * width + np.unique((column + steps) % width)).ravel()
     omega = latlong.lookup_solid_angles(height, width)[texels // width]
     unit = (flux / omega[:, None]).astype(np.float32)
-    return texels, problem.transport.probe(texels) * unit[:, None, :]
+    pictures = problem.transport.probe(texels) * unit[:, None, :]
+    if ground is not None:
+        upward = np.maximum(latlong.directions(height, width)[texels // width, texels % width, 1], 0)
+        pictures += np.float32(np.outer(upward, flux)[:, None, :] * ground.reshape(-1, 3))
+    return texels, pictures
 
 
 class Places:
@@ -68,7 +96,8 @@ class Places:
 
     def __init__(self, problem: Problem, point: Point, normal: Normal):
         self.problem, self.point = problem, point
-        self._model = _Model(problem, normal)
+        self._ground = lit_ground(problem, point)
+        self._model = _Model(problem, normal, problem.blocks.cells(self._ground))
 
     def best(self, light: int) -> list[Place]:
         """List the :data:`PLACES_REFINED` best places of a light, :data:`PLACES_APART_COSINE`.
@@ -100,7 +129,7 @@ class Places:
         for spacing, reach in zip(PROBE_SPACINGS, PROBE_REACH, strict=True):
             if self.problem.transport.capacity < (2 * reach + 1) ** 2:
                 break  # memory leaves no exact columns to refine
-            texels, pictures = probed(self.problem, row, column, flux, spacing, reach)
+            texels, pictures = probed(self.problem, row, column, flux, spacing, reach, self._ground)
             strengths, falls = self._model.of_pixels(pictures)
             at = int(np.argmax(falls))
             if not falls[at] > 0:
@@ -121,22 +150,22 @@ class Places:
 class _Model:
     """F around a point, as its normal equations have it."""
 
-    def __init__(self, problem, normal):
-        self.problem, self.normal = problem, normal
+    def __init__(self, problem, normal, cells):
+        self.problem, self.normal, self.cells = problem, normal, cells
         self._lower = np.linalg.cholesky(normal.hessian)
         self._gradient = forward(self._lower, normal.gradient)
 
     def of_cells(self, flux):
         """Return strength and fall of F for a flux (3,) in each cell of the sky."""
-        parts, blocks = self.normal.blocks, self.problem.blocks
+        parts, cells = self.normal.blocks, self.cells
         columns = zip(parts.jacobian, parts.squared.T, flux, strict=True)
-        mixed = [*blocks.products([j * (f * w)[:, None] for j, w, f in columns])]
+        mixed = [*cells.products([j * (f * w)[:, None] for j, w, f in columns])]
         if parts.lights:
-            mixed.append(sum(blocks.products([b * f for b, f in zip(parts.lights, flux, strict=True)])))
-        pull = sum(blocks.products(list((parts.pulled * flux).T[..., None])))[0]
-        power = blocks.power(parts.squared * flux**2).sum(axis=0)
+            mixed.append(sum(cells.products([b * f for b, f in zip(parts.lights, flux, strict=True)])))
+        pull = sum(cells.products(list((parts.pulled * flux).T[..., None])))[0]
+        power = cells.power(parts.squared * flux**2).sum(axis=0)
         by_blocks = self.normal.mean_of_rest.by_blocks.T
-        mean = blocks.products([b[:, None] * f for b, f in zip(by_blocks, flux, strict=True)])
+        mean = cells.products([b[:, None] * f for b, f in zip(by_blocks, flux, strict=True)])
         return self._best(np.concatenate(mixed), pull, power, np.concatenate(mean))
 
     def of_pixels(self, pictures):

@@ -14,7 +14,7 @@ import numpy as np
 from envedit.core import latlong
 from envedit.core.arrays import flat, tensor
 from envedit.losses import display_curve
-from envedit.solve.light_places import PLACES_APART_COSINE, PLACES_REFINED, probed
+from envedit.solve.light_places import PLACES_APART_COSINE, PLACES_REFINED, lit_ground, probed
 from envedit.solve.likelihood import Likelihood, of_mean
 from envedit.solve.map_problem import Problem
 
@@ -41,16 +41,18 @@ def best(
     if point.residual is None or not len(directions):
         return []
     own, flux = k < lights.own, lights.flux[k]
-    pixels = np.maximum(np.bincount(blocks.block_of, minlength=blocks.count), 1)[:, None]
+    ground = lit_ground(problem, point)
+    weight = blocks.summed(likelihood.weight)
+    total = np.maximum(weight, 1e-30)
     compared = _Comparison(
         likelihood=likelihood,
         sigma=sigma,
-        before=blocks.summed(point.rendering) / pixels,
-        target=blocks.summed(problem.picture) / pixels,
-        weight=blocks.summed(likelihood.weight)[:, 0],
+        before=blocks.summed(likelihood.weight * point.rendering) / total,
+        target=blocks.summed(likelihood.weight * problem.picture) / total,
+        weight=weight[:, 0],
         share=blocks.summed(likelihood.share)[:, 0],
     )
-    factors, unlikeliness = compared.best(blocks.of_cells(flux), own)
+    factors, unlikeliness = compared.best(blocks.cells(ground).of(flux), own)
     if away is not None:
         unlikeliness = np.where(directions @ away > PLACES_APART_COSINE, np.inf, unlikeliness)
     lights_refined = []
@@ -59,11 +61,11 @@ def best(
         if not np.isfinite(unlikeliness[at]):
             break
         unlikeliness = np.where(directions @ directions[at] > PLACES_APART_COSINE, np.inf, unlikeliness)
-        lights_refined.append(_refined(problem, point, flux, own, directions[at], sigma))
+        lights_refined.append(_refined(problem, point, flux, own, directions[at], sigma, ground))
     return [(direction, np.full(3, np.log(factor)), least) for direction, factor, least in lights_refined]
 
 
-def _refined(problem, point, flux, own, direction, sigma):
+def _refined(problem, point, flux, own, direction, sigma, ground):
     """Look around a direction through exact columns; returns direction, factor of the flux, and -2 log."""
     likelihood = problem.likelihood
     height, width = problem.envmap.shape[:2]
@@ -77,7 +79,7 @@ def _refined(problem, point, flux, own, direction, sigma):
     )
     row, column = (round(float(x)) for x in latlong.texel_position(direction, height, width))
     for spacing in TRIAL_SPACINGS:
-        texels, pictures = probed(problem, row, column, flux, spacing, reach=1)
+        texels, pictures = probed(problem, row, column, flux, spacing, reach=1, ground=ground)
         factors, unlikeliness = compared.best([tensor(one) for one in pictures.T], own)
         at = int(np.argmin(unlikeliness))
         row, column = divmod(int(texels[at]), width)

@@ -280,7 +280,6 @@ def test_paint_is_explained_by_lights_where_adam_is_to_make_no_step(tmp_path, rn
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(reason="the sun dims and does not move")
 def test_layers_follow_a_painted_picture_and_its_mask(tmp_path):
     """Painted: the ball under a sun elsewhere, a black bar across it, which the mask leaves out."""
     picture, wanted = np.full((16, 32, 3), 0.3, np.float32), np.full((16, 32, 3), 0.3, np.float32)

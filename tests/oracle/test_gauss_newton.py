@@ -1075,6 +1075,40 @@ def test_gradient_where_rows_below_the_horizon_follow(horizon, rng):
         np.testing.assert_allclose(normal.gradient[some], slope, rtol=0, atol=close, err_msg=kind)
 
 
+def test_a_light_in_a_new_place_lights_the_ground_in_its_picture_too(rng):
+    """Of a flux in a texel, the rendering changes by it and by ground as much brighter as its irradiance."""
+    image, transport = clouds(rng) + lamp(), DenseTransport.random(rng, FILM, GRID, even=0.9)
+    layers = Layers.of(image, cycles=3, horizon="keep")
+    problem = Problem(layers, transport, image, shown(transport, image))
+    state = problem.state(layers.start())
+    state["flux"][0] = -30
+    point = problem.evaluate(state)
+    ground = light_places.lit_ground(problem, point)
+    flux, up = np.array([3.0, 2.0, 1.0]), layers.shape[0]
+    omega = latlong.lookup_solid_angles(*GRID)
+    texels, pictures = light_places.probed(problem, 4, 30, flux, spacing=2, reach=1, ground=ground)
+    of_cells = [m.numpy() for m in problem.blocks.cells(ground).of(flux)]
+    size = np.bincount(problem.blocks.block_of)[:, None]
+    assert len(texels) == 9
+    for texel, picture in zip(texels, pictures, strict=True):
+        row, column = divmod(int(texel), GRID[1])
+        more = point.edited.copy()
+        more[row, column] += flux / omega[row]
+        before, after = (layers.ground_light.irradiance(one[:up]) for one in (point.edited, more))
+        more[up:] *= 1 + layers.lit[up:, None, None] * (after / before - 1)
+        change = shown(transport, more) - shown(transport, point.edited)
+        np.testing.assert_allclose(picture.reshape(*FILM, 3), change, rtol=1e-3, atol=1e-4 * change.max())
+        alone = np.zeros_like(more)
+        alone[row, column] = flux / omega[row]
+        unlit = shown(transport, alone)
+        assert not np.allclose(unlit, change, rtol=1e-2, atol=1e-3 * change.max())  # negative control
+        _, directions = problem.blocks.sky
+        nearest = int(np.argmax(directions @ latlong.directions(*GRID)[row, column]))
+        by_blocks = problem.blocks.summed(change) / size
+        got = np.stack([channel[:, nearest] for channel in of_cells], axis=1)
+        np.testing.assert_allclose(got.mean(axis=0), by_blocks.mean(axis=0), rtol=0.15)
+
+
 @pytest.mark.slow
 def test_gradient_by_the_sky_is_exact_where_a_block_is_not(rng):
     """Pixels of a block that each see another sky: the gradient goes through T, not through their mean."""

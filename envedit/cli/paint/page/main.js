@@ -308,9 +308,10 @@ function viewed(stroke) {
 // A highlight or a shadow is dragged: first ask whose it is, then where that light must go. A drag is one step of
 // history: it ends with the answer to the last question, or after UNANSWERED where none comes.
 const UNANSWERED = 5000;
-let picked = -1, point = [], place = null, asked = 0, answered = 0, ended = false, unanswered = 0, held = null;
+let dragged = tool, picked = -1, point = [], place = null, asked = 0, answered = 0, ended = false, unanswered = 0, held = null;
 function pick(phase, x, y, event) {
-  const placing = PICKS[tool]?.[1];
+  if (phase === "start") dragged = tool; // another may be chosen before all is answered
+  const placing = PICKS[dragged][1];
   if (phase === "start") {
     clearTimeout(unanswered);
     picked = placing && lights.list()[lights.chosen] ? lights.chosen : -1;
@@ -335,7 +336,7 @@ function pick(phase, x, y, event) {
   ask(x, y);
 }
 function ask(x, y) {
-  connection.send({ type: "pick", of: PICKS[tool][0], point, x, y, light: picked, view, number: ++asked });
+  connection.send({ type: "pick", of: PICKS[dragged][0], point, x, y, light: picked, view, number: ++asked });
 }
 RECEIVED.picked = (message) => {
   if (message.client !== client) return;
@@ -355,7 +356,7 @@ RECEIVED.picked = (message) => {
   } else {
     picked = message.light;
     lights.place(picked, message);
-    const does = PICKS[tool]?.[1];
+    const does = PICKS[dragged][1];
     say(does && `Light ${lights.chosen + 1} ${does}: azimuth ${Math.round(message.azimuth)}, elevation ${Math.round(message.elevation)} degrees`, true);
   }
   if (!ended || answered !== asked) return;

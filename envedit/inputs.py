@@ -18,7 +18,7 @@ from envedit.core.rows import Rows
 from envedit.images import analytic_sky, images, map_regions
 from envedit.representations.layers import unclip
 from envedit.representations.layers.oriented import oriented, oriented_share
-from envedit.representations.layers.placed_lights import PlacedLights, missing
+from envedit.representations.layers.placed_lights import ByHand, PlacedLights, missing
 from envedit.scene import scene as scenes
 from envedit.scene import supported
 from envedit.scene.scene import Scene
@@ -209,31 +209,27 @@ def _by_hand(settings, input_map):
     """Return a map as ``lights``, ``regions`` and its orientation ask, in this order."""
     if not settings.lights and not settings.regions and not any(settings.orientation):
         return input_map
-    placed = locked = None
-    radiance = input_map.radiance
+    placed = None
     warnings = [*input_map.warnings]
-    kept = map_regions.kept(settings.regions, *radiance.shape[:2])
-    if settings.lights or kept is not None:
-        placed = PlacedLights(radiance, settings.horizon)
-        lights = placed.locking(settings.lights, kept)
-        radiance = placed.place(lights)
-        locked = placed.locked(lights, settings.regions)
-        locked = None if locked is None else oriented(locked, settings.orientation)
+    if settings.lights or any(region["action"] == "keep" for region in settings.regions):
+        placed = PlacedLights(input_map.radiance, settings.horizon)
+        changed = placed.by_hand(settings.lights, settings.regions)
         if lacking := missing(settings.lights, len(placed.lights)):
             count = len(placed.lights)
             known = f"the map has {count} light{'s' if count != 1 else ''}"
             entries = "entry is" if len(lacking) == 1 else "entries are"
             numbers = ", ".join(map(str, lacking))
             warnings.append(f"input.lights: got light = {numbers}, but {known}; the {entries} ignored")
-    radiance = map_regions.changed(radiance, settings.regions)
+    else:
+        changed = ByHand(map_regions.changed(input_map.radiance, settings.regions))
     return replace(
         input_map,
-        stored=oriented(input_map.as_stored(radiance), settings.orientation),
+        stored=oriented(input_map.as_stored(changed.envmap), settings.orientation),
         warnings=warnings,
         placed=placed,
         unmoved=input_map.radiance,
-        locked=locked,
-        kept=None if kept is None else oriented_share(kept, settings.orientation),
+        locked=None if changed.locked is None else oriented(changed.locked, settings.orientation),
+        kept=None if changed.kept is None else oriented_share(changed.kept, settings.orientation),
     )
 
 

@@ -225,20 +225,18 @@ class Session:
     def _aim(self, document):
         """Take lights and orientation of a document for the map that is painted on."""
         self.document, self._dragged = document, False
-        self.origin = self._by_hand(document)
+        changed = self.placed.by_hand(document.lights, document.regions)
+        self.origin = oriented(changed.envmap, document.orientation)
+        locked = None if changed.locked is None else oriented(changed.locked, document.orientation)
+        self.kept = None if changed.kept is None else oriented_share(changed.kept, document.orientation)
         given = self.project.settings.input
         horizon = below_horizon.treatment(given.horizon, given.rows, self.origin)
-        kept = map_regions.kept(document.regions, *self.map.shape[:2])
-        locked = self.placed.locked(self.placed.locking(document.lights, kept), document.regions)
-        locked = None if locked is None else oriented(locked, document.orientation)
-        kept = None if kept is None else oriented_share(kept, document.orientation)
-        self.kept = kept
         layers = Layers.of(
             self.origin[self.rows.slice],
             self.rows.place,
             horizon=horizon,
             fixed=None if locked is None else locked[self.rows.slice],
-            kept=None if kept is None else kept[self.rows.slice],
+            kept=None if self.kept is None else self.kept[self.rows.slice],
         )
         self.transport.resolve(self.origin, limit=COLUMNS)
         self.base = self.transport.apply(tensor(self.origin)).numpy()
@@ -251,17 +249,16 @@ class Session:
         self._paint()
         self._tell_lights()
 
-    def _by_hand(self, document, lights=None):
-        placed = map_regions.changed(self.placed.place(document.lights), document.regions)
-        return oriented(placed, document.orientation, lights)
-
     def _drag(self):
         """Show the map with its lights placed, and what paint has added to it before."""
         if not self._dragged:
             self._quick.resolve(self.point.edited, limit=COLUMNS)
             self._still_quick = self._quick.apply(tensor(self.point.edited)).numpy()
         self._dragged, self.solving = True, False
-        origin = self._by_hand(self.document, lights=[])  # to look for them takes longer than a frame
+        document = self.document
+        placed = map_regions.changed(self.placed.place(document.lights), document.regions)
+        # To look for its lights takes longer than a frame.
+        origin = oriented(placed, document.orientation, lights=[])
         found = np.maximum(origin + (self.point.edited - self.origin), 0).astype(np.float32)
         self._quick.probe(self._quick.bright_texels(found)[: min(DRAGGED_COLUMNS, self._quick.capacity)])
         changed = self._quick.apply(tensor(found)).numpy() - self._still_quick

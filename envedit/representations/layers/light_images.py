@@ -74,12 +74,16 @@ def _levels(path):
 def _read(path, _changed):
     image, _ = images.read(path)
     require_radiance(image, path, brightest=BRIGHTEST)
-    shrink = max(1.0, max(image.shape[:2]) / MOST_PIXELS)
-    image = resampling.fit(image, *(max(1, round(side / shrink)) for side in image.shape[:2]))
+    image = _smaller(image, max(1.0, max(image.shape[:2]) / MOST_PIXELS))
     brightest = float((image @ np.array(LUMINANCE, np.float32)).max())
     if not brightest > 0:
         raise InputError(f"{path}: is black: a light with it has no colour")
     levels = [np.maximum(image / np.float32(brightest), DARKEST)]
     while max(levels[-1].shape[:2]) > 1:
-        levels.append(resampling.fit(levels[-1], *((side + 1) // 2 for side in levels[-1].shape[:2])))
+        levels.append(_smaller(levels[-1], 2))
     return levels
+
+
+def _smaller(image, factor):
+    height, width, _ = image.shape
+    return resampling.fit(image, height=math.ceil(height / factor), width=math.ceil(width / factor))

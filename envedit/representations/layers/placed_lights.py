@@ -7,7 +7,7 @@ Lights of the map move as :mod:`.layers` moves them, with their glow. A light th
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -30,6 +30,14 @@ GAUSSIAN_REACH = 5.0
 """Standard deviations at which a Gaussian light ends, at 4e-6 of its peak."""
 ROWS = 128
 """Rows of a map that are worked on at a time: some 100 MB of a map 8192 texels wide."""
+
+
+class ByHand(NamedTuple):
+    """A map that was changed by hand, before it is rotated."""
+
+    envmap: np.ndarray  # (H, W, 3) float32
+    locked: np.ndarray | None = None  # (H, W, 3), what of it is of locked lights; None: none is locked
+    kept: np.ndarray | None = None  # (H, W), how far it is kept, 0 to 1; None: nowhere
 
 
 class PlacedLights:
@@ -116,16 +124,19 @@ class PlacedLights:
         known = light["light"] <= len(self.lights)
         return self.lights[light["light"] - 1].direction if known else None
 
-    def locked(self, placed: Sequence[dict], regions: Sequence[dict] = ()) -> np.ndarray | None:
-        """Return what locked lights add to the placed map, (H, W, 3) float32; None where none is locked.
+    def by_hand(self, placed: Sequence[dict], regions: Sequence[dict]) -> ByHand:
+        """Place lights, then change regions; a light in a region that is kept is locked.
 
-        ``regions`` are then changed in it (:func:`.map_regions.changed`).
+        Errors are those of :meth:`place` and :func:`.map_regions.changed`.
         """
+        kept = map_regions.kept(regions, *self.envmap.shape[:2])
+        placed = self.locking(placed, kept)
+        envmap = map_regions.changed(self.place(placed), regions)
         others = without_locked(placed)
         if others is None:
-            return None
-        whole, dark = (map_regions.changed(self.place(lights), regions) for lights in (placed, others))
-        return np.maximum(whole - dark, 0)
+            return ByHand(envmap, None, kept)
+        dark = map_regions.changed(self.place(others), regions)
+        return ByHand(envmap, np.maximum(envmap - dark, 0), kept)
 
 
 def flux_of(light: dict) -> np.ndarray:

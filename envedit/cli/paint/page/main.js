@@ -49,7 +49,7 @@ const history = new History((phase, document) => {
 });
 
 const compare = new Compare(frames, displays, history, plain, { view: () => view, send: (message) => connection.send(message) });
-const zooms = [new Zoom($("render").parentElement, redraw, () => strokes.cancel()), new Zoom($("map-stack"), redraw)];
+const zooms = [new Zoom($("render").parentElement, redraw, () => strokes.cancel()), new Zoom($("map-stack"), redraw, () => regions.cancel())];
 function redraw() { displays.render.draw(); displays.map.draw(); strokes.draw(); }
 
 function send(document, phase) {
@@ -488,8 +488,10 @@ $("redo").addEventListener("click", () => history.redo());
 $("clear").addEventListener("click", () => history.push(EMPTY));
 $("save").addEventListener("click", save);
 $("add").addEventListener("click", () => lights.add());
+$("region").addEventListener("click", () => { if (regions.active && lights.turning) $("turn").click(); });
 $("turn").addEventListener("click", () => {
   lights.turning = !lights.turning;
+  if (lights.turning && regions.active) regions.toggle();
   $("turn").setAttribute("aria-pressed", String(lights.turning));
   $("handles").classList.toggle("turning", lights.turning);
 });
@@ -568,7 +570,7 @@ window.addEventListener("keydown", (event) => {
   else if (key === "o" && !event.repeat) outline();
   else if (key === "m") compare.large();
   else if (key === "l") $("level").click();
-  else if (key === "g") regions.toggle();
+  else if (key === "g") $("region").click();
   else if (key === "a") compare.keep();
   else if (key === "h") compare.toggle();
   else if (key === "+" || key === "-") zooms[0].by(key === "+" ? 1.2 : 1 / 1.2);

@@ -5,7 +5,7 @@ const turned = (a, b, degrees) => {
   const c = Math.cos(degrees * RADIANS), s = Math.sin(degrees * RADIANS);
   return [c * a - s * b, s * a + c * b];
 };
-const direction = ({ azimuth, elevation }) => {
+export const direction = ({ azimuth, elevation }) => {
   const a = azimuth * RADIANS, e = elevation * RADIANS;
   return [Math.cos(e) * Math.sin(a), Math.sin(e), -Math.cos(e) * Math.cos(a)];
 };

@@ -1,6 +1,6 @@
 // Regions of the map as in [[input.regions]]: painted by a brush, shown over the map, and changed in a panel.
 
-import { unseen } from "./orientation.js";
+import { direction, unseen } from "./orientation.js";
 
 const WIDTH = 256, HEIGHT = 128; // pixels of what is shown over the map
 const COLOURS = { keep: [90, 230, 120], scale: [110, 170, 255], fill: [255, 120, 90] };
@@ -65,7 +65,7 @@ export class Regions {
     this.holder.setPointerCapture(event.pointerId);
     this.begin(this.at(event));
     this.holder.onpointerup = () => this.end();
-    this.holder.onpointercancel = () => { this.points = null; this.draw(); };
+    this.holder.onpointercancel = () => this.cancel();
   }
 
   hover(event) {
@@ -86,6 +86,11 @@ export class Regions {
     this.points = this.holder.onpointerup = this.holder.onpointercancel = null;
     this.on.done({ regions: [...this.list(), region] });
     this.choose(this.list().length - 1);
+  }
+
+  cancel() {
+    this.points = this.holder.onpointerup = this.holder.onpointercancel = null;
+    this.draw();
   }
 
   // Arrows move the brush, space begins and ends a stroke.
@@ -231,10 +236,7 @@ function within(corners, azimuth, elevation) {
   return Number(inside);
 }
 
-const toward = ([azimuth, elevation]) => {
-  const a = azimuth * RADIANS, e = elevation * RADIANS;
-  return [Math.cos(e) * Math.sin(a), Math.sin(e), -Math.cos(e) * Math.cos(a)];
-};
+const toward = ([azimuth, elevation]) => direction({ azimuth, elevation });
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
 const angle = (a, b) => Math.acos(Math.max(-1, Math.min(1, dot(a, b))));

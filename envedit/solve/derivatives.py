@@ -79,7 +79,7 @@ class Derivatives:
     def _lights(self, point):
         """Return derivatives by lights and saturation, what these are, and the profile."""
         # ---- Cores through T: rendered, and by two angles and by size
-        state, layers, sky = point.state, self.layers, point.sky
+        state, layers = point.state, self.layers
         lights: list = []
         names: list = []
         # Columns of one light must not take the place of another's.
@@ -105,13 +105,15 @@ class Derivatives:
 
         # ---- Glows, and the ground that lights shine on, through the blocks
         profile = self._profile(point, [pictures[0] for *_, pictures in lights])
-        sky = sky * layers.changeable
+        params = self.unknowns.params(state)
+        slope = layers.glow_slope(params, point.sky) if layers.lights.glowing else None
         for i, turns, cores, pictures in lights:
             log_glow, *ends = (self._log_glow(state, i, one) for one in turns)
             change = None
             if log_glow is not None:
                 # d log(1 + s G) / d log s = s G / (1 + s G), which is 1 - 1 / (1 + s G)
-                change = np.stack([sky * -np.expm1(-log_glow), *(sky * d for d in self._differences(ends))])
+                by_turn = (slope * one for one in self._differences(ends))
+                change = np.stack([slope * -np.expm1(-log_glow), *by_turn])
             change = self._with_lit_ground(point, cores[:3], change)
             if change is not None:
                 pictures[:3] += self.blocks.pictures(change) * profile.reshape(-1, 3)

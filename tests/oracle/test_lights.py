@@ -340,7 +340,7 @@ def test_without_a_glow_in_the_map_spare_lights_have_that_of_a_clear_sun(rng):
     flux[1] = np.log(2.0)
     at = np.radians([10.0, 60.0, 130.0])
     d = mi.Vector3f(np.stack([np.sin(at), np.cos(at), 0 * at]).astype(np.float32))
-    expected = 1 + 2 * np.exp(-np.array([10, 60, np.inf]) / 12)[:, None] * 2 * made.flux[1] / 3
+    expected = 1 + 0.75 * np.exp(-np.array([10, 60, np.inf]) / 16)[:, None] * 2 * made.flux[1] / 3
     np.testing.assert_allclose(made.glow_of(1, single(turn), single(flux), d).numpy().T, expected, rtol=1e-4)
     for irradiance in (0.0, 1e-300):
         table = Lights(own, (0, H), W, irradiance=irradiance).glows[1]

@@ -118,3 +118,26 @@ def test_a_sun_that_rises_or_sets_is_in_its_place_and_tears_nothing(elevation, a
     for apart in (lambda a: np.diff(a, axis=0), lambda a: (a - np.roll(a, 1, axis=1))[1:]):
         steps = [np.abs(apart(one))[away[1:] & away[:-1]].max() for one in logs]
         assert steps[0] < 1.6 * steps[1] + 0.02
+
+
+@pytest.mark.slow
+def test_a_glow_adds_to_a_cloud_what_it_adds_to_the_sky():
+    """It is haze before the cloud; a dark outline is brightened in proportion, and stays dark."""
+    new = D[SUN] * [-1, 1, -1]
+    away = np.degrees(np.arccos(np.clip(D @ new, -1, 1)))
+    column = np.degrees(np.arctan2(D[..., 0], -D[..., 2])) - np.degrees(np.arctan2(new[0], -new[2]))
+    column = (column + 180) % 360 - 180
+    plain = sky(sun=None)
+    bodies = [(away > 8) & (away < 20) & (sign * column > 4) & (D[..., 1] > 0) for sign in (1, -1)]
+    plain[bodies[0]] *= 4  # a cloud
+    plain[bodies[1]] *= 0.05  # a tree
+    image = plain * np.float32(1 + 8 * np.exp(-AWAY / 10))[..., None]
+    image[SUN] = 5e4
+    made = Layers.of(image, horizon="keep")
+    edited = made.decode(sent(made, made.start(), new)).numpy()
+    more = [(edited - plain)[body].mean() for body in bodies]
+    factor = [(edited / plain)[body].mean() for body in bodies]
+    clear = sky(sun=None)
+    expected = [(clear * 8 * np.exp(-away / 10)[..., None])[body].mean() for body in bodies]
+    assert 0.7 < more[0] / expected[0] < 1.4  # in proportion to the cloud it would be 4
+    assert 1.5 < factor[1] < 9 and more[1] < 0.1 * expected[1]

@@ -341,3 +341,29 @@ def test_black_map_stays_black():
     got = made.decode(params).numpy()
     assert np.isfinite(got).all() and np.abs(got).max() < 1e-9
     assert made.separation.lights == []
+
+
+@pytest.mark.parametrize("horizon", ["keep", "mirror"])
+def test_the_slope_of_a_glow_is_that_of_the_sky_by_its_flux(horizon):
+    """Where it has grown, where it is gone, and in the mirror below the horizon."""
+    image = sky() * np.float32(1 + 0.3 * np.sin(9 * latlong.directions(*SHAPE)[..., :1]))
+    made = Layers.of(image, horizon=horizon)
+    params = sent(made, made.start(), made.lights.centres[0] * [-1, 1, -1])
+    real = params["flux"].numpy()
+
+    def at(change):
+        flux = real.copy()
+        flux[0] += change / layers.SCALES["flux"]
+        return np.float64(made.parts(params | {"flux": single(flux)})[0].numpy())
+
+    log_glow = made.log_glow_of(
+        0, params["turn"].numpy() * layers.SCALES["turn"], real * layers.SCALES["flux"]
+    )
+    slope = made.glow_slope(params, at(0).astype(np.float32)) * -np.expm1(-log_glow)
+    expected = (at(0.05) - at(-0.05)) / 0.1
+    up = made.shape[0]
+    # A difference of 0.05 is off where the glow is as before, in the kink between growing and going.
+    assert np.abs(slope - expected)[:up].max() < 0.03 * expected[:up].max()
+    if horizon == "mirror":  # what follows is blurred, which the slope is not
+        near = slice(up, up + 2)
+        assert np.abs(slope - expected)[near].max() < 0.2 * expected[:up].max()

@@ -255,24 +255,35 @@ def test_lights_do_not_depend_on_the_resolution():
 # ---- glow --------------------------------------------------------------------------------------------------
 
 
-def glowing(elevation, azimuth, strength, decay, unrest):
-    """Return a sun in a glow, the sky without both, and the glow's factor at every texel."""
+def glowing(elevation, azimuth, strength, decay, unrest, horizon=0.0):
+    """Return a sun in a glow, the sky without both, and the glow's factor at every texel.
+
+    The sky is exp(``horizon``) times as bright at the horizon as at the poles.
+    """
     d, v = latlong.directions(128, 256), toward(elevation, azimuth)
     away = angle(d, v)
     glow = (strength * np.exp(-away / decay) * (away < 70))[..., None] * [1, 0.9, 0.7]
     rng = np.random.default_rng(0)
     base = np.exp(unrest * rng.standard_normal((128, 256, 1))) * [0.3, 0.4, 0.6]
+    base *= np.exp(horizon * (1 - np.abs(d[..., 1:2])))
     m = base * (1 + glow)
     m[away < 1] += 3e4
     return m, base, glow, away
 
 
 @pytest.mark.parametrize(
-    "elevation, azimuth, strength, decay, unrest",
-    [(45, 100, 5, 8, 0), (30, 0, 10, 15, 0.1), (3, 10, 20, 10, 0), (80, 200, 5, 8, 0.1)],
+    "elevation, azimuth, strength, decay, unrest, horizon",
+    [
+        (45, 100, 5, 8, 0, 0),
+        (30, 0, 10, 15, 0.1, 0),
+        (3, 10, 20, 10, 0, 0),
+        (80, 200, 5, 8, 0.1, 0),
+        (20, 100, 8, 12, 0, 1.5),
+        (10, 200, 8, 12, 0.1, 1.0),
+    ],
 )
-def test_a_glow_is_found_and_taken_from_the_sky(elevation, azimuth, strength, decay, unrest):
-    m, base, glow, away = glowing(elevation, azimuth, strength, decay, unrest)
+def test_a_glow_is_found_and_taken_from_the_sky(elevation, azimuth, strength, decay, unrest, horizon):
+    m, base, glow, away = glowing(elevation, azimuth, strength, decay, unrest, horizon)
     s = checked(m)
     (light,) = s.lights
     ratio = (s.glow / (1 + glow))[away > 3]

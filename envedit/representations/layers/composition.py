@@ -55,6 +55,7 @@ class Fields:
     # Share of the saturation and of the gain that acts on a texel, 0 to 1; None: all
     share: mi.Float | None = None
     kept: mi.Float | None = None  # how far a texel stays as it is, 0 to 1; None: nowhere
+    log_glow: mi.Color3f | None = None  # further log factor of the glows, for derivatives by it
 
 
 class Composed(NamedTuple):
@@ -87,9 +88,13 @@ def compose(base: mi.Color3f, directions: mi.Vector3f | None, fields: Fields) ->
     if fields.glows is not None:
         glows = fields.glows
         glow = glows.lights.glow(glows.turn, glows.log_flux, directions)
+        glow = glow if fields.log_glow is None else glow * dr.exp(fields.log_glow)
         factor = settled(glow / glows.before, 1)  # exactly 1 where nothing moved
         gone = gone_of(factor)
         hidden = glows.offset + glows.slope * dr.log(base / glows.before + glows.faint)
+        # What comes is added: to a cloud no more than to the sky that is seen at its elevation
+        added = (factor - 1) * dr.exp(dr.minimum(mi.luminance(hidden), 0))
+        factor = dr.select(factor > 1, 1 + added, factor)
         factor = factor * dr.exp(gone * hidden)
     if fields.log_followed is not None:
         followed = dr.exp(fields.log_followed)

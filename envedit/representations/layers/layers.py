@@ -10,6 +10,7 @@ outside the cores: the sky's own detail is kept.
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
@@ -356,6 +357,29 @@ class Layers:
             dr.forward_to(sky)
             return self._image(dr.grad(sky)).numpy()
 
+    def glow_slope(self, params: dict, sky: np.ndarray) -> np.ndarray:
+        """Return the derivative of the map without cores by the log factor 1 + s G of a glow, (rows, W, 3).
+
+        ``sky`` is that map; there are glows. Rows that follow change by as much, relatively, as what they
+        mirror, fading.
+        """
+        real = self._real(params)
+        with dr.isolate_grad():
+            log_glow = dr.zeros(mi.Color3f, math.prod(self.shape))
+            dr.enable_grad(log_glow)
+            dr.set_grad(log_glow, 1)
+            above = self._above(real, replace(self._fields(real), log_glow=log_glow)).sky
+            dr.forward_to(above)
+            slope = self._image(dr.grad(above)).numpy()
+        if self.below is None:
+            return slope
+        up = len(slope)
+        share = np.divide(slope, sky[:up], out=np.zeros_like(slope), where=sky[:up] > 0)
+        low = sky[up:] * share[self.below.mirrored] * self.below.fade[:, None, None]
+        if self.kept is not None:
+            low *= 1 - self.kept[up:, :, None]
+        return np.concatenate([slope, low])
+
     def saturation_slope(self, params: dict) -> np.ndarray:
         """Return the derivative of the map without cores by the log saturation, (rows, W, 3): a difference.
 
@@ -383,15 +407,14 @@ class Layers:
     def log_glow_of(self, i: int, turn: np.ndarray, log_flux: np.ndarray) -> np.ndarray | None:
         """Return log(1 + s_i G_i) (rows, W, 3) of light ``i`` where it is placed; None if it has no glow.
 
+        Of rows that follow, at the texels that they mirror.
         ``turn`` and ``log_flux`` are as for :meth:`.Lights.glow`, of all lights.
         """
         if self.lights.glows[i] is None:
             return None
         factor = self.lights.glow_of(i, tensor(turn), tensor(log_flux), self._texels.directions)
         log_glow = self._image(dr.log(factor)).numpy()
-        if self.below is None:
-            return log_glow
-        return np.concatenate([log_glow, log_glow[self.below.mirrored] * self.below.fade[:, None, None]])
+        return log_glow if self.below is None else np.concatenate([log_glow, log_glow[self.below.mirrored]])
 
     # ---- rows ----------------------------------------------------------------------------------------------
 

@@ -47,8 +47,8 @@ NARROWEST = 0.4
 """Radius in texels from which a lobe is round. With the tents of its points, of variance 1/6, it makes 0.57:
 where its centre lies between texels changes its second moments by less than 2 % (derived;
 ``tests/oracle/test_lights.py`` measures it). A narrower one is interpolated as a single texel is."""
-CLEAR_GLOW = 2.0
-CLEAR_GLOW_DEGREES = 12.0
+CLEAR_GLOW = 0.75
+CLEAR_GLOW_DEGREES = 16.0
 """Glow of a sun in a clear sky: CLEAR_GLOW F / E exp(-angle / CLEAR_GLOW_DEGREES) of its radiance, F the
 sun's flux and E the irradiance of the ground by the sky. Measured on three PureSky maps with clear suns
 (``tests/oracle/test_lights.py`` compares them)."""

@@ -387,7 +387,25 @@ def components(mask: np.ndarray) -> np.ndarray:
 
 
 def _glow(image: np.ndarray, small: _Small, cores: np.ndarray, centre: np.ndarray) -> np.ndarray | None:
-    """Measure the glow around a centre: a table as :attr:`Light.glow`; None where none is believed."""
+    """Measure the glow around a centre: a table as :attr:`Light.glow`; None where none is believed.
+
+    It is what the sky around a light is brighter by than the sky of the same elevation elsewhere, which is
+    found beside a first measure of it.
+    """
+    table = _of_rings(image, small, cores, centre)
+    if table is None:
+        return None
+    glow = 1 + glow_at(table, small.directions @ centre)
+    weight = np.where(cores, 0, glow.mean(axis=2) ** -2.0)[..., None]
+    faint = max(1e-6 * float(image.mean()), 1e-30)
+    total = np.maximum(weight.sum(axis=1, keepdims=True), 1e-30)
+    level = np.exp((weight * np.log(image / glow + faint)).sum(axis=1, keepdims=True) / total)
+    relative = _of_rings(image / level, small, cores, centre)
+    return table if relative is None else relative
+
+
+def _of_rings(image, small, cores, centre):
+    """Measure a glow by rings around its centre."""
     # ---- The colour of the sky in rings around the centre
     angle = np.degrees(np.arccos(np.clip(small.directions @ centre, -1, 1)))
     lum = image @ LUMINANCE

@@ -128,11 +128,11 @@ def turned(file: Path, folder: Path) -> Path:
 
 def measure(done: Done) -> list[dict]:
     """Return rows: before the edit; what the true map itself scores, rendered twice; the edit."""
-    unedited = {"envmap": done.metrics["initial_envmap"], "render": done.metrics["initial"]}
     title = (METHODS | PAINTED)[done.case.about["row"]].title
     edited = {**done.metrics, "title": title, **seconds(done)}
     if done.case.about["row"] in PAINTED:
         return [edited]
+    unedited = {"envmap": done.metrics["initial_envmap"], "render": done.metrics["initial"]}
     return [
         {"title": "unedited", **unedited},
         {"title": "the true map", "render": done.metrics["ceiling"]},

@@ -298,6 +298,17 @@ def test_averages_are_over_maps_that_are_done_in_every_row(maps, build, tmp_path
     assert "roughness 1, 0 maps:" in text(tmp_path, made)
 
 
+def test_a_painted_edit_has_no_true_map_to_be_compared_with(tmp_path):
+    cases = EXPERIMENT.cases(Namespace(name="figure9", all_maps=False, edit="warmer"))
+    made = [(case, case.job(())) for case in cases if case.name.startswith("ours-lum-l1-sunsky")]
+    assert finish(tmp_path, made) == 1
+    file = made[0][1].folder(tmp_path) / "metrics.json"
+    about = json.loads(file.read_text()) | {"painted": {"towards": 0.5, "elsewhere": 0.01}}
+    del about["initial_envmap"]
+    file.write_text(json.dumps(about))
+    assert row_of(text(tmp_path, made), "+ L_lum + L_l1") == [["0.50", "0.010", "30"]]
+
+
 def test_the_seconds_of_a_fit_are_those_of_the_run_that_made_it(maps, build, tmp_path):
     made = build("table3", *(f"paper-{row}-dusk" for row in ("r-siren", "r-siren-reg", "pixels")))
     finish(tmp_path, made, "r-siren-dusk-0.0", fit_s=840.0)

@@ -4,8 +4,10 @@
 
 E_0' is the original without the cores C_l of its lights. The first factor is how the glow of the lights has
 changed, exp(w r) what is seen where a glow has gone (``behind_glow.py``), k the saturation of the sky's
-colours (``saturation.py``) and g its smooth gain (``gain.py``). In rows below the horizon that follow those
-above, one factor stands for the first two (``below_horizon.py``).
+colours (``saturation.py``) and g its smooth gain (``gain.py``). Where the first factor p is above 1, it is
+1 + (p - 1) min(1, exp(lum r)): a glow adds to a cloud no more than to the sky that is seen at its elevation.
+In rows below the horizon that follow those above, one factor stands for the first two
+(``below_horizon.py``).
 
 :class:`.Layers` composes the working map, :mod:`.full_resolution` the map of the input's file: they differ in
 where these fields come from, and in how the cores are rendered, which are added to what :func:`compose`
@@ -92,7 +94,6 @@ def compose(base: mi.Color3f, directions: mi.Vector3f | None, fields: Fields) ->
         factor = settled(glow / glows.before, 1)  # exactly 1 where nothing moved
         gone = gone_of(factor)
         hidden = glows.offset + glows.slope * dr.log(base / glows.before + glows.faint)
-        # What comes is added: to a cloud no more than to the sky that is seen at its elevation
         added = (factor - 1) * dr.exp(dr.minimum(mi.luminance(hidden), 0))
         factor = dr.select(factor > 1, 1 + added, factor)
         factor = factor * dr.exp(gone * hidden)

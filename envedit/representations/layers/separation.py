@@ -2,8 +2,9 @@
 
 A map is separated as E = B * prod(1 + G_l) + sum(C_l). The **core** C_l of a light is the radiance that
 stands out: a sun's disc, a lamp, a softbox. Its **glow** G_l is what the light does to the sky around it, as
-a factor that falls with the angle to the light: when the sun moves, the clouds stay and their lighting
-changes. What is left is the background B, the map as it would be without its lights.
+a factor, beside sky of the same elevation elsewhere, that falls with the angle to the light: when the sun
+moves, the clouds stay and their lighting changes. What is left is the background B, the map as it would be
+without its lights.
 
 All steps are in angles and shares of the light, not in texels or radiance: they mean the same for a map of
 any resolution and exposure.

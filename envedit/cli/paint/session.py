@@ -27,12 +27,12 @@ import drjit as dr
 import numpy as np
 
 from envedit import inputs, pipeline, renderers
-from envedit.cli.paint import advice, picking
+from envedit.cli.paint import advice, picking, thumbnails
 from envedit.cli.paint.project import MATCHED, SOLUTION, Project
 from envedit.cli.paint.protocol import ORIENTATION, Document, Edit, Pick
 from envedit.core import latlong
 from envedit.core.arrays import tensor
-from envedit.core.color import luminance, tonemap
+from envedit.core.color import tonemap
 from envedit.core.errors import ConfigError, InputError
 from envedit.core.seeds import Seeds
 from envedit.core.types import Views
@@ -67,8 +67,6 @@ MEMORY_EVERY_S = 10.0
 """Seconds of work after which freed buffers are given back: that takes 0.1 s, 1 % of the time."""
 SKY_WIDTH = 2048
 """Most texels across of the map that is shown large: more than most displays have."""
-NOT_WHITE = 0.95
-"""Share of the pixels of the rendering that the page does not show white when it is opened."""
 
 
 class SupersededError(Exception):
@@ -176,8 +174,8 @@ class Session:
 
     @property
     def exposure(self) -> float:
-        """Stops that leave :data:`NOT_WHITE` of the pixels below white, in quarters; 0 if they are black."""
-        bright = float(np.quantile(luminance(self.before), NOT_WHITE))
+        """Stops that show most pixels below white (:func:`.thumbnails.white`), in quarters; 0 if all black."""
+        bright = thumbnails.white(self.before)
         return float(np.clip(np.round(-4 * np.log2(bright)) / 4, -8, 8)) if bright > 0 else 0.0
 
     # ---- edits ---------------------------------------------------------------------------------------------

@@ -27,7 +27,7 @@ from envedit.images import images
 WIDTH = 240
 """Pixels across: the page shows them 120 wide, on displays of two pixels a point."""
 NOT_WHITE = 0.95
-"""Share of the pixels that are not shown white."""
+"""Share of the pixels that are not shown white, of thumbnails and of a rendering when the page is opened."""
 MOST_MAPS = 24
 """Maps that are offered, those written last."""
 ENDINGS = (".exr", ".hdr")
@@ -122,6 +122,11 @@ def main(files: Sequence[tuple[str, bool]]) -> None:
         print(json.dumps({"file": file, "picture": picture}), file=answers, flush=True)
 
 
+def white(image: np.ndarray) -> float:
+    """Return the luminance that :data:`NOT_WHITE` of the pixels of linear radiance (h, w, 3) are below."""
+    return float(np.quantile(luminance(image), NOT_WHITE))
+
+
 def thumbnail(file: str, panorama: bool) -> bytes:
     """Return a PNG, :data:`WIDTH` across, of an image; InputError if it cannot be read, or is no map.
 
@@ -134,6 +139,6 @@ def thumbnail(file: str, panorama: bool) -> bytes:
     step = max(1, width // (4 * WIDTH))  # of a large one 16 texels a pixel are enough
     few = np.nan_to_num(image[::step, ::step], nan=0.0, posinf=0.0, neginf=0.0)
     small = np.maximum(fit(few, max(1, round(WIDTH * height / width)), WIDTH), 0)
-    white = float(np.quantile(luminance(small), NOT_WHITE))
-    shown = tonemap(small / white if white > 0 else small)
+    brightest = white(small)
+    shown = tonemap(small / brightest if brightest > 0 else small)
     return images.png(np.round(255 * np.clip(shown, 0, 1)).astype(np.uint8))

@@ -174,7 +174,7 @@ class Session:
 
     @property
     def exposure(self) -> float:
-        """Stops that show most pixels below white (:func:`.thumbnails.white`), in quarters; 0 if all black."""
+        """Stops that show most pixels below white (:func:`.thumbnails.white`), in quarters; 0 on black."""
         bright = thumbnails.white(self.before)
         return float(np.clip(np.round(-4 * np.log2(bright)) / 4, -8, 8)) if bright > 0 else 0.0
 

@@ -167,7 +167,7 @@ COUNTS = {
     "fuzz": 29,
     "interiors": 5,
     "layers": 96,
-    "layers.moved_lights": 6,
+    "layers.moved_lights": 12,
     "light_estimation": 6,
     "looks": 12,
     "maps_alone": 34,

@@ -9,7 +9,7 @@ import numpy as np
 from envedit.core import latlong
 from envedit.core.arrays import tensor
 from envedit.core.color import LUMINANCE, tonemap
-from envedit.core.rotations import rotation_vector
+from envedit.core.rotations import rotated, rotation_vector
 from envedit.images import images
 from envedit.losses import metrics
 from envedit.representations.layers.layers import SCALES, Layers
@@ -18,6 +18,7 @@ from experiments.harness import Done, Experiment, calling
 from experiments.summary import Summary, values
 
 WIDTH = 128
+UP = np.array([0.0, 1.0, 0.0])
 DEGREES = (100.0, 201.0)
 NEAR_DEGREES = (4.0, 35.0)
 """Angles from the strongest light, above the horizon, between which the sky is compared."""
@@ -26,15 +27,14 @@ FAINT = 1e-3
 
 def moved(made: Layers, degrees: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the map whose lights are turned about the vertical, and where the strongest is then."""
-    angle = np.radians(degrees)
-    about = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+    about = np.radians(degrees) * UP
     params = made.start()
     turn = params["turn"].numpy()
     for i in range(made.lights.own):
         centre = made.lights.centres[i]
-        turn[i] = rotation_vector(centre, about @ centre) / SCALES["turn"]
+        turn[i] = rotation_vector(centre, rotated(centre, about)) / SCALES["turn"]
     strongest = made.lights.centres[int(np.argmax(made.lights.flux[: made.lights.own] @ LUMINANCE))]
-    return made.decode(params | {"turn": tensor(turn)}).numpy(), about @ strongest
+    return made.decode(params | {"turn": tensor(turn)}).numpy(), rotated(strongest, about)
 
 
 def compare(settings, folder, file: str) -> dict:

@@ -15,7 +15,8 @@ from envedit.core.types import ArrayLike
 
 LUMINANCE = (0.2126, 0.7152, 0.0722)
 """Rec.709 weights of red, green and blue (Eq. 7)."""
-
+NOT_WHITE = 0.95
+"""Share of the pixels of a picture that are not shown white, where it is exposed to be looked at."""
 
 AXES = np.array([[1, 1, 1], [1, 0, -1], [1, -2, 1]]) / np.sqrt([[3], [2], [6]])
 """Luminance, blue-amber and green-magenta, as unit vectors of log RGB."""
@@ -26,6 +27,11 @@ def luminance(image: ArrayLike) -> np.ndarray:
     image = np.asarray(image)
     r, g, b = (np.float64(w) for w in LUMINANCE)  # float64, so that 3e38 does not overflow
     return r * image[..., 0] + g * image[..., 1] + b * image[..., 2]
+
+
+def brightest_shown(image: ArrayLike) -> float:
+    """Return the luminance that :data:`NOT_WHITE` of the pixels of linear radiance (h, w, 3) are below."""
+    return float(np.quantile(luminance(image), NOT_WHITE))
 
 
 def srgb_to_linear(t: ArrayLike) -> np.ndarray:

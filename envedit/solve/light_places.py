@@ -85,6 +85,11 @@ def probed(
     return texels, pictures
 
 
+def is_apart(direction: np.ndarray, others: list[np.ndarray]) -> bool:
+    """Whether a direction is another explanation than all others."""
+    return all(direction @ other <= PLACES_APART_COSINE for other in others)
+
+
 class Places:
     """Places of lights that are dark at a point, by the problem's normal equations there.
 
@@ -118,7 +123,8 @@ class Places:
                 break
             place = Place(directions[at], np.full(3, strengths[at]), float(falls[at]))
             place = self._refined(place, flux)
-            places_refined.append(replace(place, factor=place.factor / scale))
+            if is_apart(place.direction, [other.direction for other in places_refined]):
+                places_refined.append(replace(place, factor=place.factor / scale))
             falls = np.where(directions @ directions[at] > PLACES_APART_COSINE, 0, falls)
         return places_refined
 

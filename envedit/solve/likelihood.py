@@ -28,6 +28,7 @@ from typing import Any
 import numpy as np
 
 from envedit.core.arrays import tensor
+from envedit.core.color import brightest_shown
 from envedit.losses import display_curve
 
 INDEPENDENT = 256
@@ -51,6 +52,8 @@ class Likelihood:
     paint_noise: float | None = None  # largest standard error of paint, of display values; None: a rendering
     # (h, w, 1), how much each pixel is of the rest, in [0, 1], whose mean is to stay; None: there is none
     rest: np.ndarray | None = None
+    # Radiance from which on all was shown white, where nobody saw differences (``display_curve.py``)
+    white: float = np.inf
 
     @classmethod
     def of_paint(
@@ -67,11 +70,13 @@ class Likelihood:
         of_paint = np.maximum(weight - of_rest, 0).astype(np.float64)
         painted = float(of_paint.sum() / weight.sum(dtype=np.float64))
         rest = (1 - coverage) * (weight > 0)
+        white = max(1.0, brightest_shown(initial))
         return cls(
             weight=on_average_one(weight, weight.shape[:2]),
             independent=STATEMENTS / painted if painted > 0 else STATEMENTS,
-            paint_noise=PAINT_NOISE * _painted_change(of_paint, initial, picture),
+            paint_noise=PAINT_NOISE * _painted_change(of_paint, initial, picture, white),
             rest=rest if rest.any() else None,
+            white=white,
         )
 
     @property
@@ -152,9 +157,10 @@ class Likelihood:
         return self.misfit(residual, sigma) + 6 * self.independent * float(np.log(sigma))
 
 
-def _painted_change(weight, initial, picture):
+def _painted_change(weight, initial, picture, white):
     """Return the root mean square change of display values, where it is visible; at least what is."""
-    shown = (display_curve.to_display(tensor(np.float32(one))).numpy() for one in (initial, picture))
+    both = (tensor(np.float32(one)) for one in (initial, picture))
+    shown = (display_curve.to_display(one, white).numpy() for one in both)
     size = sizes(np.subtract(*shown, dtype=np.float64))
     weight = np.where(size > VISIBLE, weight, 0)
     total = weight.sum()

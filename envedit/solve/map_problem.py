@@ -137,8 +137,8 @@ class Problem(Unknowns):
 
     def _aim(self, picture, likelihood):
         self.picture = picture
-        self.target = display_curve.to_display(tensor(picture)).numpy()
         self.likelihood = likelihood or Likelihood(on_average_one(None, picture.shape[:2]))
+        self.target = display_curve.to_display(tensor(picture), self.likelihood.white).numpy()
 
     def aimed_at(self, picture: np.ndarray, likelihood: Likelihood | None, point: Point) -> Point:
         """Take another target, with its likelihood; returns a point with its residual from that target."""
@@ -165,7 +165,8 @@ class Problem(Unknowns):
 
     def residual(self, state: dict, rendering: np.ndarray) -> np.ndarray:
         """Return display values of a rendering (h, w, 3), under a camera's factor, less the target's."""
-        shown = display_curve.to_display(tensor(rendering * self._exposure(state))).numpy()
+        exposed = tensor(rendering * self._exposure(state))
+        shown = display_curve.to_display(exposed, self.likelihood.white).numpy()
         residual = np.float64(shown) - self.target
         if self.clipped is None:
             return residual
@@ -178,7 +179,7 @@ class Problem(Unknowns):
     def _slope(self, point):
         """Return the derivative of the residual by radiance, (h, w, 3)."""
         exposure = self._exposure(point.state)
-        slope = display_curve.slope(point.rendering * exposure) * exposure
+        slope = display_curve.slope(point.rendering * exposure, self.likelihood.white) * exposure
         if self.clipped is None:
             return slope
         return np.where(self.clipped & (point.residual >= 0), 0, slope).astype(np.float32)

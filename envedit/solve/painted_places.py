@@ -14,7 +14,7 @@ import numpy as np
 from envedit.core import latlong
 from envedit.core.arrays import flat, tensor
 from envedit.losses import display_curve
-from envedit.solve.light_places import PLACES_APART_COSINE, PLACES_REFINED, lit_ground, probed
+from envedit.solve.light_places import PLACES_APART_COSINE, PLACES_REFINED, is_apart, lit_ground, probed
 from envedit.solve.likelihood import Likelihood, of_mean
 from envedit.solve.map_problem import Problem
 
@@ -55,14 +55,16 @@ def best(
     factors, unlikeliness = compared.best(blocks.cells(ground).of(flux), own)
     if away is not None:
         unlikeliness = np.where(directions @ away > PLACES_APART_COSINE, np.inf, unlikeliness)
-    lights_refined = []
+    lights_refined: list[tuple[np.ndarray, np.ndarray, float]] = []
     for _ in range(PLACES_REFINED):
         at = int(np.argmin(unlikeliness))
         if not np.isfinite(unlikeliness[at]):
             break
         unlikeliness = np.where(directions @ directions[at] > PLACES_APART_COSINE, np.inf, unlikeliness)
-        lights_refined.append(_refined(problem, point, flux, own, directions[at], sigma, ground))
-    return [(direction, np.full(3, np.log(factor)), least) for direction, factor, least in lights_refined]
+        direction, factor, least = _refined(problem, point, flux, own, directions[at], sigma, ground)
+        if is_apart(direction, [other for other, _, _ in lights_refined]):
+            lights_refined.append((direction, np.full(3, np.log(factor)), least))
+    return lights_refined
 
 
 def _refined(problem, point, flux, own, direction, sigma, ground):
@@ -130,7 +132,8 @@ class _Comparison:
         column, end, width = dr.arange(mi.UInt32, k), dr.opaque(mi.UInt32, count), dr.opaque(mi.UInt32, k)
         factors = [flat(mi.Float, row) for row in factors]
         before = flat(mi.Float, np.float32(self.before))
-        goal = display_curve.to_display(tensor(self.target)).array
+        goal = display_curve.to_display(tensor(self.target), self.likelihood.white).array
+        white = dr.opaque(mi.Float, self.likelihood.white)
         weight, share = (flat(mi.Float, np.float32(one)) for one in (self.weight, self.share))
         dr.eval(goal)
 
@@ -140,7 +143,7 @@ class _Comparison:
                 more = dr.gather(mi.Float, picture.array, row * width + column)
                 now, to = (dr.gather(mi.Float, one, 3 * row + c) for one in (before, goal))
                 for i, factor in enumerate(factors):
-                    off = display_curve.shown(now + more * factor) - to
+                    off = display_curve.shown(now + more * factor, white) - to
                     squares[i] = squares[i] + mi.Float64(w * dr.square(off))
                     means[3 * i + c] = means[3 * i + c] + mi.Float64(part * off)
             return row + 1, squares, means

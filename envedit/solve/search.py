@@ -219,15 +219,17 @@ def _descended(problem, done, run, sigma, steps):
 
 
 def _moves(problem, best, sigma):
-    """List the most promising move of each kind from an explanation."""
+    """List the moves of each kind that promise as much from an explanation as the best one does."""
     painted = not problem.likelihood.robust
-    most_promising: dict[tuple[int, str], _Move] = {}
+    of_kind: dict[tuple[int, str], list[_Move]] = {}
     for move in (_under_the_original if painted else _beside_the_sky)(problem, best, sigma):
-        kind = move.light, move.what
-        least = most_promising[kind].gain if kind in most_promising else -np.inf
-        if move.gain > least:
-            most_promising[kind] = move
-    return list(most_promising.values())
+        of_kind.setdefault((move.light, move.what), []).append(move)
+    return [
+        move
+        for moves in of_kind.values()
+        for move in moves
+        if move.gain > max(one.gain for one in moves) - POSITIVE_EVIDENCE
+    ]
 
 
 def _beside_the_sky(problem, best, sigma):

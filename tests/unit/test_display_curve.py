@@ -9,12 +9,12 @@ from envedit.losses import display_curve
 from tests.oracles.plain import plain_display, single
 
 
-def shown(x):
-    return display_curve.to_display(single(np.reshape(x, (1, 1, -1)))).numpy().ravel()
+def shown(x, white=math.inf):
+    return display_curve.to_display(single(np.reshape(x, (1, 1, -1))), white).numpy().ravel()
 
 
-def slope(x):
-    return display_curve.slope(np.reshape(x, (1, 1, -1))).ravel()
+def slope(x, white=math.inf):
+    return display_curve.slope(np.reshape(x, (1, 1, -1)), white).ravel()
 
 
 def test_display_values_by_formula():
@@ -40,9 +40,20 @@ def test_display_slope_is_the_finite_difference_and_meets_at_one():
     np.testing.assert_allclose(slope([0.999999, 1.0, 1.000001]), 1 / 2.2, rtol=1e-5)
 
 
+@pytest.mark.parametrize("white", [1.0, 3.0, 1e6])
+def test_differences_above_white_count_for_a_share_and_others_as_before(white):
+    x = np.array([1e-3, 0.18, 1.0, 1.5, 4.0, 65504.0, 1e30])
+    joint, whole = plain_display(white), plain_display(x)
+    above = joint + display_curve.ABOVE_WHITE * (whole - joint)
+    np.testing.assert_allclose(shown(x, white), np.where(x > white, above, whole), rtol=2e-6)
+    factor = np.where(x > white, display_curve.ABOVE_WHITE, 1)
+    np.testing.assert_allclose(slope(x[x != white], white), (factor * slope(x))[x != white], rtol=1e-5)
+
+
 def test_display_slope_is_finite_and_positive_at_the_extremes():
-    found = slope([0, 1e-38, 1e-30, 1e-3, 65504, 1e6, 1e30])
-    assert np.isfinite(found).all() and (found > 0).all()
+    for white in (1.0, math.inf):
+        found = slope([0, 1e-38, 1e-30, 1e-3, 65504, 1e6, 1e30], white)
+        assert np.isfinite(found).all() and (found > 0).all()
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf])

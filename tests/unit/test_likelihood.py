@@ -116,6 +116,19 @@ def test_noise_of_paint_is_at_most_a_share_of_the_change_that_is_seen():
     assert nothing.noise(residual, 1e-3) == pytest.approx(PAINT_NOISE * VISIBLE)
 
 
+@pytest.mark.parametrize(("before", "white"), [(0.0, 1.0), (0.2, 1.0), (4.0, 4.0)])
+def test_white_is_what_most_of_the_picture_was_below_and_at_least_one(before, white):
+    coverage = np.zeros((*FILM, 1), np.float32)
+    coverage[:5] = 1
+    initial, painted = pictures(coverage, before, white * np.e)
+    initial[coverage[..., 0] > 0] = white  # a change from white to a brighter white
+    weight = pixel_weight(coverage, np.zeros(FILM, bool), 1.0, 0.3)
+    one = Likelihood.of_paint(weight, coverage, np.where(coverage > 0, initial, before), painted)
+    assert one.white == pytest.approx(white)
+    assert one.paint_noise == pytest.approx(PAINT_NOISE * display_curve.ABOVE_WHITE / 2.2, rel=1e-4)
+    assert Likelihood(one.weight).white == np.inf
+
+
 @pytest.mark.parametrize("film", [(6, 8), FILM, (64, 64)])
 def test_noise_with_hubers_loss_makes_the_misfit_that_of_independent_values(film, rng):
     one = Likelihood(on_average_one(None, film))

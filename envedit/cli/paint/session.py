@@ -27,18 +27,17 @@ import drjit as dr
 import numpy as np
 
 from envedit import inputs, pipeline, renderers
-from envedit.cli.paint import advice, picking, thumbnails
+from envedit.cli.paint import advice, picking
 from envedit.cli.paint.project import MATCHED, SOLUTION, Project
 from envedit.cli.paint.protocol import ORIENTATION, Document, Edit, Pick
 from envedit.core import latlong
 from envedit.core.arrays import tensor
-from envedit.core.color import tonemap
+from envedit.core.color import brightest_shown, tonemap
 from envedit.core.errors import ConfigError, InputError
 from envedit.core.seeds import Seeds
 from envedit.core.types import Views
 from envedit.export import adjustments, file_resolution
 from envedit.images import images, map_regions
-from envedit.losses import display_curve
 from envedit.losses.perceptual import installed
 from envedit.report import output_folder, run_folder
 from envedit.representations.layers import below_horizon
@@ -174,8 +173,8 @@ class Session:
 
     @property
     def exposure(self) -> float:
-        """Stops that show most pixels below white (:func:`.thumbnails.white`), in quarters; 0 on black."""
-        bright = thumbnails.white(self.before)
+        """Stops that show most pixels below white (:func:`.brightest_shown`), in quarters; 0 on black."""
+        bright = brightest_shown(self.before)
         return float(np.clip(np.round(-4 * np.log2(bright)) / 4, -8, 8)) if bright > 0 else 0.0
 
     # ---- edits ---------------------------------------------------------------------------------------------
@@ -578,9 +577,8 @@ class Session:
             self.tell.frame("render", source, rendering, self.scene.rows)
             self.tell.frame("map", source, shown)
         if not self._dragged:
-            both = self.target, self.point.rendering
-            target, solution = (display_curve.to_display(tensor(one)).numpy() for one in both)
-            self.tell.frame("difference", source, target - solution, self.scene.rows)
+            difference = tonemap(self.target) - tonemap(self.point.rendering)
+            self.tell.frame("difference", source, difference, self.scene.rows)
 
     def sky(self) -> None:
         """Show the map large, as it is edited and as it was given, at the resolution of its file."""

@@ -19,15 +19,13 @@ from pathlib import Path
 
 import numpy as np
 
-from envedit.core.color import luminance, tonemap
+from envedit.core.color import brightest_shown, tonemap
 from envedit.core.errors import EnveditError, InputError
 from envedit.core.resampling import fit
 from envedit.images import images
 
 WIDTH = 240
 """Pixels across: the page shows them 120 wide, on displays of two pixels a point."""
-NOT_WHITE = 0.95
-"""Share of the pixels that are not shown white, of thumbnails and of a rendering when the page is opened."""
 MOST_MAPS = 24
 """Maps that are offered, those written last."""
 ENDINGS = (".exr", ".hdr")
@@ -122,15 +120,10 @@ def main(files: Sequence[tuple[str, bool]]) -> None:
         print(json.dumps({"file": file, "picture": picture}), file=answers, flush=True)
 
 
-def white(image: np.ndarray) -> float:
-    """Return the luminance that :data:`NOT_WHITE` of the pixels of linear radiance (h, w, 3) are below."""
-    return float(np.quantile(luminance(image), NOT_WHITE))
-
-
 def thumbnail(file: str, panorama: bool) -> bytes:
     """Return a PNG, :data:`WIDTH` across, of an image; InputError if it cannot be read, or is no map.
 
-    Exposed so that :data:`NOT_WHITE` of the pixels are not white, under gamma.
+    Exposed for its :func:`.brightest_shown`, under gamma.
     """
     image, _ = images.read(file)
     height, width, _ = image.shape
@@ -139,6 +132,6 @@ def thumbnail(file: str, panorama: bool) -> bytes:
     step = max(1, width // (4 * WIDTH))  # of a large one 16 texels a pixel are enough
     few = np.nan_to_num(image[::step, ::step], nan=0.0, posinf=0.0, neginf=0.0)
     small = np.maximum(fit(few, max(1, round(WIDTH * height / width)), WIDTH), 0)
-    brightest = white(small)
+    brightest = brightest_shown(small)
     shown = tonemap(small / brightest if brightest > 0 else small)
     return images.png(np.round(255 * np.clip(shown, 0, 1)).astype(np.uint8))

@@ -228,7 +228,7 @@ def _moves(problem, best, sigma):
         move
         for moves in of_kind.values()
         for move in moves
-        if move.gain > max(one.gain for one in moves) - POSITIVE_EVIDENCE
+        if move.gain >= max(one.gain for one in moves) - POSITIVE_EVIDENCE
     ]
 
 

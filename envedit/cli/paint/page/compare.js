@@ -10,7 +10,7 @@ const NAMES = { strokes: "strokes", lights: "lights", regions: "regions of the m
 
 export class Compare {
   constructor(frames, displays, history, plain, on) {
-    Object.assign(this, { frames, displays, history, on, kept: null, thumbs: new WeakMap(), asked: false }); // on: view(), send(message)
+    Object.assign(this, { frames, displays, history, on, kept: null, thumbs: new WeakMap(), drawn: [], asked: false }); // on: view(), send(message)
     displays.sky = new Display($("sky"), "radiance", plain);
     this.zoom = new Zoom($("sky").parentElement, () => displays.sky.draw());
     $("keep-a").addEventListener("click", () => this.keep());
@@ -95,18 +95,27 @@ export class Compare {
 
   draw() {
     if ($("steps").hidden) return;
-    const { steps, at } = this.history, first = Math.max(0, steps.length - SHOWN_STEPS);
-    $("steps").replaceChildren(...steps.slice(first).map((step, k) => {
-      const i = first + k, button = document.createElement("button"), thumb = this.thumbs.get(step);
-      button.dataset.testid = `step-${i}`;
-      button.title = i ? changed(steps[i - 1], step) : "the beginning";
-      button.setAttribute("aria-label", `Step ${i}: ${button.title}`);
-      button.setAttribute("aria-pressed", String(i === at));
-      button.append(thumb ?? String(i));
-      button.addEventListener("click", () => this.history.go(i));
-      return button;
-    }));
+    const { steps, at } = this.history, first = Math.max(0, steps.length - SHOWN_STEPS), shown = steps.slice(first);
+    // Buttons stay while their steps do: a click on one that is replaced meanwhile would be lost.
+    if (shown.length !== this.drawn.length || shown.some((step, k) => step !== this.drawn[k])) {
+      $("steps").replaceChildren(...shown.map((step, k) => this.button(step, first + k)));
+      this.drawn = shown;
+    }
+    shown.forEach((step, k) => {
+      const button = $("steps").children[k];
+      button.setAttribute("aria-pressed", String(first + k === at));
+      button.replaceChildren(this.thumbs.get(step) ?? String(first + k));
+    });
     $("steps").children[at - first]?.scrollIntoView({ block: "nearest", inline: "nearest" });
+  }
+
+  button(step, i) {
+    const button = document.createElement("button");
+    button.dataset.testid = `step-${i}`;
+    button.title = i ? changed(this.history.steps[i - 1], step) : "the beginning";
+    button.setAttribute("aria-label", `Step ${i}: ${button.title}`);
+    button.addEventListener("click", () => this.history.go(i));
+    return button;
   }
 }
 

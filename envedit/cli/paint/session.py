@@ -38,6 +38,7 @@ from envedit.core.seeds import Seeds
 from envedit.core.types import Views
 from envedit.export import adjustments, file_resolution
 from envedit.images import images, map_regions
+from envedit.losses import display_curve
 from envedit.losses.perceptual import installed
 from envedit.report import output_folder, run_folder
 from envedit.representations.layers import below_horizon
@@ -577,8 +578,9 @@ class Session:
             self.tell.frame("render", source, rendering, self.scene.rows)
             self.tell.frame("map", source, shown)
         if not self._dragged:
-            difference = tonemap(self.target) - tonemap(self.point.rendering)
-            self.tell.frame("difference", source, difference, self.scene.rows)
+            both, white = (self.target, self.point.rendering), self.problem.likelihood.white
+            target, solution = (display_curve.to_display(tensor(one), white).numpy() for one in both)
+            self.tell.frame("difference", source, target - solution, self.scene.rows)
 
     def sky(self) -> None:
         """Show the map large, as it is edited and as it was given, at the resolution of its file."""

@@ -22,6 +22,7 @@ from envedit.export import full_resolution
 from envedit.maps import looks
 from envedit.maps.looks import Look
 from envedit.representations.layers import lights as layer_lights
+from envedit.representations.layers.aureoles import glow_strength
 from envedit.representations.layers.layers import Layers
 from envedit.representations.layers.placed_lights import angles
 from envedit.representations.layers.separation import GLOW_DEGREES
@@ -148,9 +149,10 @@ def _aureole(layers, key):
     flux = 2.0**key.flux * looks.sky_irradiance(layers, layers.base)
     own = layers.lights.glows[looks.roles(layers).get("key", -1)]
     height = AUREOLE if own is None else max(AUREOLE - own[5] @ LUMINANCE, 0.0)
-    table = height * np.exp(-GLOW_DEGREES / AUREOLE_DEGREES)[:, None] * layers.lights.flux[-1]
+    strength = glow_strength(flux / layers.lights.flux[-1])
+    table = height * np.exp(-GLOW_DEGREES / AUREOLE_DEGREES)[:, None] / np.maximum(strength, 1e-30)
     table[-1] = 0
-    return table / max(flux, 1e-30)
+    return table
 
 
 def _turn(working, look):

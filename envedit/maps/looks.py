@@ -26,7 +26,8 @@ from envedit.core.errors import ConfigError, InputError
 from envedit.core.types import FilePath
 from envedit.export import light_list
 from envedit.representations.layers import below_horizon
-from envedit.representations.layers.layers import Layers, ground_irradiance
+from envedit.representations.layers.aureoles import ground_irradiance
+from envedit.representations.layers.layers import Layers
 from envedit.representations.layers.placed_lights import angles, direction
 
 ROLES = ("key", "fill", "rim")

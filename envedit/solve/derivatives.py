@@ -13,6 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from envedit.core.rotations import rotated, rotation_vector
+from envedit.representations.layers.aureoles import log_strength_slope
+from envedit.representations.layers.lights import flux_factor
 from envedit.solve.block_jacobian import BlockJacobian
 from envedit.solve.unknowns import Point, Unknowns
 from envedit.transport.light_transport import COLUMNS_A_LOOK, LightTransport
@@ -111,9 +113,10 @@ class Derivatives:
             log_glow, *ends = (self._log_glow(state, i, one) for one in turns)
             change = None
             if log_glow is not None:
-                # d log(1 + s G) / d log s = s G / (1 + s G), which is 1 - 1 / (1 + s G)
+                # d log(1 + f G) / d log f is f G / (1 + f G), which is 1 - 1 / (1 + f G)
+                by_flux = -np.expm1(-log_glow) * log_strength_slope(flux_factor(state["flux"][i]))
                 by_turn = (slope * one for one in self._differences(ends))
-                change = np.stack([slope * -np.expm1(-log_glow), *by_turn])
+                change = np.stack([slope * by_flux, *by_turn])
             change = self._with_lit_ground(point, cores[:3], change)
             if change is not None:
                 pictures[:3] += self.blocks.pictures(change) * profile.reshape(-1, 3)

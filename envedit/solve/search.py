@@ -48,8 +48,7 @@ FADED_LOG_FLUX, FADED_LIGHT_COST = -1.0, 6 * INDEPENDENT * np.log(1.1)
 """Log flux of a light of the map, over its own, below which it has faded, and what such a light costs under a
 rendered target: as noise that is a tenth larger. Under clouds there is no sun; its disc would be seen."""
 SOFT_DEGREES = 2.0
-"""Radius of the lobe that takes the place of a light where a shadow is to be softer, and of a light that is
-added to a map without any."""
+"""Radius of the lobe that takes the place of a light where a shadow is to be softer."""
 
 
 @dataclass(frozen=True)
@@ -319,7 +318,7 @@ def _changes(problem, state, start, sigma):
             yield k, REMOVED, dark, start, _unlikeliness(problem, dark, sigma), -ADDED_LIGHT_COST
 
     # ---- one more
-    size = lights.log_size(LOBE_DEGREES if lights.own else SOFT_DEGREES)
+    size = lights.log_size(LOBE_DEGREES)
     for k in spare[:1]:
         for direction, flux, unlikeliness in painted_places.best(problem, state, k, sigma):
             turn = rotation_vector(lights.centres[k], direction)

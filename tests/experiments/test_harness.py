@@ -172,6 +172,7 @@ COUNTS = {
     "looks": 12,
     "maps_alone": 34,
     "natural": 680,
+    "natural.aureoles": len(MAPS),
     "natural.skies": 1,
     "paint.artists": 12,
     "paint.figure10": 7,

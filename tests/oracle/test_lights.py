@@ -14,7 +14,7 @@ from envedit.core import latlong
 from envedit.core.color import LUMINANCE
 from envedit.core.rotations import rotation_vector
 from envedit.images import images
-from envedit.representations.layers import layers, lights
+from envedit.representations.layers import aureoles, layers, lights
 from envedit.representations.layers.lights import DARK, LOBE_DEGREES, SPARE, Lights
 from envedit.representations.layers.separation import GLOW_DEGREES, Light, glow_at
 from tests.oracles.plain import single
@@ -335,26 +335,58 @@ def test_spare_lights_are_round(width, degrees, rng):
 
 def test_without_a_glow_in_the_map_spare_lights_have_that_of_a_clear_sun(rng):
     own = [patch(rng, 4, 10)]
-    made = Lights(own, (0, H), W, irradiance=3.0)
+    sky = np.full((H, W, 3), 3.0 / np.pi)
+    made = Lights(own, (0, H), W, background=sky)
+    assert made.flux[1] @ LUMINANCE == pytest.approx(20 * 3, rel=0.01)
     turn, flux, _ = (np.array(p) for p in place(made, flux=DARK))
-    flux[1] = np.log(2.0)
+    flux[1] = np.log(0.25)
     at = np.radians([10.0, 60.0, 130.0])
     d = mi.Vector3f(np.stack([np.sin(at), np.cos(at), 0 * at]).astype(np.float32))
-    expected = 1 + 0.75 * np.exp(-np.array([10, 60, np.inf]) / 16)[:, None] * 2 * made.flux[1] / 3
-    np.testing.assert_allclose(made.glow_of(1, single(turn), single(flux), d).numpy().T, expected, rtol=1e-4)
-    for irradiance in (0.0, 1e-300):
-        table = Lights(own, (0, H), W, irradiance=irradiance).glows[1]
-        assert table is None or np.isfinite(np.float32(table)).all()
+    expected = 1 + 15 * np.exp(-np.array([10, 60, np.inf]) / 16)[:, None] * np.full(3, 2 * 0.25 / 1.25)
+    np.testing.assert_allclose(made.glow_of(1, single(turn), single(flux), d).numpy().T, expected, rtol=1e-2)
+    for radiance in (0.0, 1e-300):
+        made = Lights(own, (0, H), W, background=np.full((H, W, 3), radiance))
+        assert made.glows[1] is None and np.isfinite(made.flux).all()
 
 
 @pytest.mark.parametrize("name", ["autumn_field", "rustig_koppie", "syferfontein_18d_clear"])
 def test_the_glow_of_a_clear_sun_is_that_of_photographed_ones(name, data):
     image, _ = images.load_envmap(str(data / "puresky" / f"{name}_puresky_1k.hdr"), 256)
     made = layers.Layers.of(image[:64], (0, 128))
-    irradiance = layers.ground_irradiance(made.base, (0, 128))
-    expected = lights.clear_glow(made.lights.flux[0] / irradiance)[5:31] @ LUMINANCE
+    flux = made.lights.flux[0] / aureoles.ground_irradiance(made.base, (0, 128))
+    strength = aureoles.glow_strength(flux / aureoles.CLEAR_FLUX)
+    expected = (aureoles.clear_glow() * strength)[5:31] @ LUMINANCE
     ratio = made.lights.glows[0][5:31] @ LUMINANCE / expected
-    assert 0.55 < ratio.min() < 1 < ratio.max() < 1.6
+    assert 0.5 < ratio.min() < 1 < ratio.max() < 1.6
+
+
+def test_a_glow_is_as_bright_wherever_its_light_is(rng):
+    """A light that moves from the darker to the brighter half of a sky: its glow adds as much radiance."""
+    table = np.exp(-np.maximum(GLOW_DEGREES - 2, 0) / 8)[:, None] * np.ones(3) * (GLOW_DEGREES < 40)[:, None]
+    light = patch(rng, 12, 16, glow=table)
+    bright = np.where(latlong.directions(H, W)[..., :1] * np.sign(light.direction[0]) > 0, 1.0, 5.0)
+    made = Lights([light], (0, H), W, background=bright * np.ones(3))
+    turn, flux, _ = (np.array(p) for p in place(made, flux=DARK))
+    flux[0] = 0
+    beside = []
+    for degrees in (0.0, 180.0):
+        turn[0] = [0, np.radians(degrees), 0]
+        at = turned(turn[0], light.direction[None])
+        d = mi.Vector3f(np.ascontiguousarray(at.T, np.float32))
+        beside.append(made.glow_of(0, single(turn), single(flux), d).numpy()[0, 0] - 1)
+    assert beside[0] == pytest.approx(1, rel=1e-3)
+    assert beside[1] == pytest.approx(1 / 5, rel=0.1)
+
+
+def test_twice_a_sun_has_less_than_twice_its_glow(rng):
+    table = np.exp(-np.maximum(GLOW_DEGREES - 2, 0) / 8)[:, None] * np.ones(3) * (GLOW_DEGREES < 40)[:, None]
+    light = patch(rng, 12, 16, glow=table)
+    made = Lights([light], (0, H), W)
+    d = mi.Vector3f(np.ascontiguousarray(light.direction[:, None], np.float32))
+    for factor, strength in ((1e-9, 0), (0.5, 2 / 3), (1, 1), (2, 4 / 3), (1e9, 2)):
+        turn, flux, _ = place(made, flux=np.log(factor))
+        glow = made.glow_of(0, turn, flux, d).numpy() - 1
+        np.testing.assert_allclose(glow, strength, rtol=1e-3, atol=1e-6)
 
 
 def test_spare_lights_have_the_glow_of_the_strongest_light_in_proportion_to_flux(rng):
@@ -368,7 +400,10 @@ def test_spare_lights_have_the_glow_of_the_strongest_light_in_proportion_to_flux
     turn[3], flux[3] = random_turn(rng), np.log(strength * made.flux[0] / made.flux[3])
     got = made.glow_of(3, single(turn), single(flux), d).numpy()
     cosine = d.numpy().T @ turned(turn[3], UP[None])[0]
-    np.testing.assert_allclose(got.T, 1 + strength * glow_at(table, cosine), rtol=1e-3)
+    share = made.flux[3] / made.flux[0]
+    factor = strength / share
+    expected = 1 + 2 * factor / (1 + factor) * share * glow_at(table, cosine)
+    np.testing.assert_allclose(got.T, expected, rtol=1e-3)
 
 
 def test_the_glow_before_an_edit_has_no_spare_light_in_it(rng):
@@ -504,7 +539,8 @@ def plain_glow(own, turns, fluxes, d):
     factor = np.ones((len(d), 3))
     for light, turn, flux in zip(own, turns, fluxes, strict=True):
         if light.glow is not None:
-            factor *= 1 + glow_at(light.glow, d @ turned(turn, light.direction[None])[0]) * np.exp(flux)
+            strength = 2 * np.exp(flux) / (1 + np.exp(flux))
+            factor *= 1 + glow_at(light.glow, d @ turned(turn, light.direction[None])[0]) * strength
     return factor
 
 

@@ -44,6 +44,17 @@ def test_a_sky_that_is_the_same_around_the_horizon_stays():
     np.testing.assert_allclose(got, level, rtol=0.02)
 
 
+def test_roofs_are_no_sky():
+    """Dark houses over half of the horizon do not darken the sky where a sun was."""
+    level = np.exp(D[..., 1:2]) * [0.4, 0.5, 0.7]
+    roofs = (D @ [D[SUN][0], 0, D[SUN][2]] < 0)[..., None] & (np.abs(D[..., 1:2]) < np.sin(np.radians(40)))
+    houses = np.where(roofs, 0.05, level)
+    got = changed(houses, 1 + 8 * np.exp(-AWAY / 12)[..., None] * np.ones(3))
+    near = AWAY < 12
+    assert 0.4 < roofs[SUN[0]].mean() < 0.6 and not roofs[near].any()
+    np.testing.assert_allclose(got[near], level[near], rtol=0.25)  # with them off by 0.86
+
+
 @pytest.mark.parametrize("level", [0.0, 1e-30, 1e-6, 65504.0])
 @pytest.mark.parametrize("shape", [(3, 2), (4, 6), (9, 16)])
 def test_extremes_stay_finite(level, shape):

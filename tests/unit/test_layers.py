@@ -360,6 +360,7 @@ def test_the_slope_of_a_glow_is_that_of_the_sky_by_its_flux(horizon):
         0, params["turn"].numpy() * layers.SCALES["turn"], real * layers.SCALES["flux"]
     )
     slope = made.glow_slope(params, at(0).astype(np.float32)) * -np.expm1(-log_glow)
+    slope *= 0.5  # d log f / d log s of f = 2 s / (1 + s) at 1
     expected = (at(0.05) - at(-0.05)) / 0.1
     up = made.shape[0]
     # A difference of 0.05 is off where the glow is as before, in the kink between growing and going.

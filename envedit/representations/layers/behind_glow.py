@@ -9,9 +9,10 @@ seen there instead is
 
 the texture stays, at no more than the contrast that it has at this elevation, but for that within K of a
 light's core, where k is 0: it is bloom and no cloud. Level and colour are those of the elevation. Means are
-weighted by 1 / glow^2: they describe the sky away from the lights. A texel goes from B to R by w, the share
-of its radiance that was the glow's and is gone, E = B G exp(w (log R - b)) with w = max(1 - G / G_0, 0): a
-light that has not moved changes nothing, and there is no edge.
+weighted by 1 / glow^2, and by less where it is darker than they are: they describe the sky away from the
+lights, and no roofs or trees. A texel goes from B to R by w, the share of its radiance that was the glow's
+and is gone, E = B G exp(w (log R - b)) with w = max(1 - G / G_0, 0): a light that has not moved changes
+nothing, and there is no edge.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ import numpy as np
 
 from envedit.core import latlong
 from envedit.core.color import LUMINANCE
-from envedit.representations.layers.separation import Light
+from envedit.representations.layers.separation import Light, away_weight, mean_at_elevation, sky_weight
 
 BLUR_DEGREES = 4.0
 """Standard deviation of K: what is finer is texture, what is coarser the sky's brightness. Measured: with 2
@@ -89,10 +90,10 @@ def behind_glow(
     low = _blurred(logs, BLUR_DEGREES, rows)
     texture = np.square((logs - low) @ LUMINANCE)[..., None]
     around = np.maximum(_blurred(texture, 2 * BLUR_DEGREES, rows), 0)  # a cut spectrum rings
-    weight = np.maximum(glow.mean(axis=2, keepdims=True) ** -2.0, 1e-30)
+    weight = sky_weight(low, away_weight(glow))
 
     def at_elevation(values):
-        mean = (values * weight).sum(axis=1) / weight.sum(axis=1)
+        mean = mean_at_elevation(values, weight)[:, 0]
         return (_along_rows(shape[0], BLUR_DEGREES, rows[1]) @ mean)[:, None]
 
     contrast = np.sqrt(np.minimum((at_elevation(texture) + LEAST_VARIANCE) / (around + LEAST_VARIANCE), 1))

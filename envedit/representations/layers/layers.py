@@ -45,18 +45,6 @@ SATURATION_STEP = 0.05
 tangent: ``docs/decisions/slope_of_the_saturation.md``."""
 
 
-def ground_irradiance(sky: np.ndarray, rows: tuple[int, int]) -> float:
-    """Return the luminance of the irradiance of level ground by a sky (n, W, 3) without lights.
-
-    ``rows`` are its first row in the map, and the rows of the map; those below the horizon light nothing.
-    """
-    first, total = rows
-    polar = np.pi * np.arange(first, first + len(sky)) / max(total - 1, 1)
-    cosine = np.maximum(np.cos(polar), 0)
-    weight = latlong.lookup_solid_angles(total, sky.shape[1])[first : first + len(sky)] * cosine
-    return float(weight @ (sky.astype(np.float64) @ LUMINANCE).sum(axis=1))
-
-
 @dataclass(frozen=True)
 class TexelFields:
     """What parameters do to every texel of a working map, (rows, W, 3) float32 each."""
@@ -161,8 +149,7 @@ class Layers:
         # ---- Lights, and the map without their cores
         separation = separate(above, rows, MOVABLE)
         core = separation.core
-        irradiance = ground_irradiance(np.maximum(above - core, 0), rows)
-        lights = Lights(separation.lights, rows, image.shape[1], aureoles, irradiance)
+        lights = Lights(separation.lights, rows, image.shape[1], aureoles, separation.background)
         base = np.where((core > 0).any(axis=2, keepdims=True), above - core, above)
         base = np.maximum(base, 0).astype(np.float32)
 
@@ -358,7 +345,7 @@ class Layers:
             return self._image(dr.grad(sky)).numpy()
 
     def glow_slope(self, params: dict, sky: np.ndarray) -> np.ndarray:
-        """Return the derivative of the map without cores by the log factor 1 + s G of a glow, (rows, W, 3).
+        """Return the derivative of the map without cores by the log factor 1 + f G of a glow, (rows, W, 3).
 
         ``sky`` is that map; there are glows. Rows that follow change by as much, relatively, as what they
         mirror, fading.
@@ -405,7 +392,7 @@ class Layers:
         return slopes
 
     def log_glow_of(self, i: int, turn: np.ndarray, log_flux: np.ndarray) -> np.ndarray | None:
-        """Return log(1 + s_i G_i) (rows, W, 3) of light ``i`` where it is placed; None if it has no glow.
+        """Return log(1 + f_i G_i) (rows, W, 3) of light ``i`` where it is placed; None if it has no glow.
 
         Of rows that follow, at the texels that they mirror.
         ``turn`` and ``log_flux`` are as for :meth:`.Lights.glow`, of all lights.

@@ -25,7 +25,8 @@ from envedit.core import latlong
 from envedit.core.arrays import tensor
 from envedit.core.color import LUMINANCE
 from envedit.core.types import ArrayLike
-from envedit.representations.layers.separation import GLOW_DEGREES, Light
+from envedit.representations.layers.aureoles import CLEAR_FLUX, Aureole, Sky, clear_glow
+from envedit.representations.layers.separation import Light
 
 SPARE = 2
 """Lights beside the map's own, dark until one is needed: lobes. Not measured: each costs as much as a light
@@ -47,13 +48,8 @@ NARROWEST = 0.4
 """Radius in texels from which a lobe is round. With the tents of its points, of variance 1/6, it makes 0.57:
 where its centre lies between texels changes its second moments by less than 2 % (derived;
 ``tests/oracle/test_lights.py`` measures it). A narrower one is interpolated as a single texel is."""
-CLEAR_GLOW = 0.75
-CLEAR_GLOW_DEGREES = 16.0
-"""Glow of a sun in a clear sky: CLEAR_GLOW F / E exp(-angle / CLEAR_GLOW_DEGREES) of its radiance, F the
-sun's flux and E the irradiance of the ground by the sky. Measured on three PureSky maps with clear suns
-(``tests/oracle/test_lights.py`` compares them)."""
-MOST_GLOW = 1e30
-"""Most of F / E: of a sky of 1e-30 the glow stays within float32. Derived."""
+LEAST_IRRADIANCE = 1e-25
+"""Least irradiance of a sky beside which spare lights are measured: fluxes stay within float32. Derived."""
 LOG_SIZES = (-6.0, 3.0)
 """Log sizes are cut to these: from a texel's fraction to twenty times the light. Not measured."""
 MOST_LOG_FLUX = 30.0
@@ -88,8 +84,8 @@ class Lights:
     aureoles : bool or ndarray (len(GLOW_DEGREES), 3)
         Spare lights have a glow; without it what surrounds a light that is added is left to the gain. A table
         is the glow that they have.
-    irradiance : float
-        Of the ground by the sky without its lights, luminance.
+    background : ndarray (rows, W, 3), optional
+        The map without its lights; by default glows are as bright wherever their lights are.
 
     Attributes
     ----------
@@ -99,10 +95,11 @@ class Lights:
         Directions of unmoved lights; spare ones are at the zenith.
     flux : ndarray (count, 3)
         Flux of unmoved lights, radiance times steradian; spare ones have the mean of the others, at least
-        :data:`FAINTEST` of it in every channel, or 1.
+        :data:`FAINTEST` of it in every channel, or 1; in a sky where no light has a glow, scaled to
+        :data:`.CLEAR_FLUX` of its irradiance.
     glows : list of ndarray (len(GLOW_DEGREES), 3) or None
         As of :class:`.separation.Light`, of lights of :attr:`flux`. Spare ones have that of the strongest
-        light with a glow, or of a sun in a clear sky where none has one, in proportion to flux; or the table
+        light with a glow, in proportion to flux, or of a sun in a clear sky where none has one; or the table
         of ``aureoles``.
     """
 
@@ -112,7 +109,7 @@ class Lights:
         rows: tuple[int, int],
         width: int,
         aureoles: bool | np.ndarray = True,
-        irradiance: float = 0.0,
+        background: np.ndarray | None = None,
     ):
         first, total = rows
         self.own = len(lights)
@@ -132,6 +129,11 @@ class Lights:
         own = np.array([flux.sum(axis=0) for flux in fluxes]).reshape(-1, 3)
         spare = own.mean(axis=0) if len(own) else np.ones(3)
         spare = np.maximum(spare, FAINTEST * spare.max())
+        sky = None if background is None else Sky.of(background, rows)
+        strongest = _strongest([light.glow for light in lights], own)
+        clear = sky is not None and strongest is None and sky.irradiance > LEAST_IRRADIANCE
+        if clear:
+            spare *= CLEAR_FLUX * sky.irradiance / (spare @ LUMINANCE)
         for _ in range(SPARE):
             d, weight, spacing = lobe()
             directions.append(d)
@@ -159,19 +161,21 @@ class Lights:
         self.glows = [light.glow for light in lights]
         added = aureoles if isinstance(aureoles, np.ndarray) else None
         if aureoles is True:
-            added = _glow_in_proportion(self.glows, own, spare)
-            if added is None and irradiance > 0:
-                added = clear_glow(spare / irradiance)
+            added = clear_glow() if clear else None
+            if strongest is not None:
+                own_flux = np.maximum(own[strongest], FAINTEST * own[strongest].max())
+                added = self.glows[strongest] * (spare / own_flux)
         self.glows += [added] * SPARE
-        self._glow = [
-            None if glow is None else dr.opaque(mi.Float(glow.astype(np.float32).ravel()))
-            for glow in self.glows
+        homes = [*self.centres[: self.own], *[None if strongest is None else self.centres[strongest]] * SPARE]
+        self._aureoles = [
+            None if glow is None else Aureole(glow, home, sky)
+            for glow, home in zip(self.glows, homes, strict=True)
         ]
 
     @property
     def glowing(self) -> bool:
         """Whether any light has a glow."""
-        return any(glow is not None for glow in self._glow)
+        return any(aureole is not None for aureole in self._aureoles)
 
     def log_size(self, degrees: float) -> float:
         """Return the log size of a spare light of a radius, at least that from which it is round."""
@@ -245,10 +249,7 @@ class Lights:
         return cores.numpy().reshape(-1, *shape, 3)
 
     def glow(self, turn: mi.TensorXf, log_flux: mi.TensorXf, d: mi.Vector3f) -> mi.Color3f:
-        """Evaluate the product of 1 + s_l G_l over all lights, as they are placed, at directions ``d``.
-
-        s_l is the factor of the light's flux: a glow is put out with its light.
-        """
+        """Evaluate the product over all lights, as they are placed, of what :meth:`glow_of` returns."""
         factor = mi.Color3f(1)
         for i in range(self.count):
             factor *= self.glow_of(i, turn, log_flux, d)
@@ -261,13 +262,14 @@ class Lights:
         return self.glow(tensor(np.zeros_like(log_flux)), tensor(log_flux), d)
 
     def glow_of(self, i: int, turn: mi.TensorXf, log_flux: mi.TensorXf, d: mi.Vector3f) -> mi.Color3f:
-        """Evaluate 1 + s_i G_i of light ``i`` alone; 1 if it has no glow."""
-        if self._glow[i] is None:
+        """Evaluate 1 + f c G of light ``i`` alone at directions ``d`` (``aureoles.py``); 1 without a glow."""
+        aureole = self._aureoles[i]
+        if aureole is None:
             return mi.Color3f(1)
         index = dr.opaque(mi.UInt32, i)
         centre = rotate(_row(mi.Vector3f, turn, index), dr.gather(mi.Vector3f, self._centre, index))
         factor = _exp(_row(mi.Color3f, log_flux, index))
-        return 1 + interpolated_glow(self._glow[i], dr.dot(d, centre)) * factor
+        return 1 + aureole.at(d, centre, factor)
 
 
 def placed(
@@ -376,24 +378,10 @@ def _widths(wide, added):
     return dr.select(added, dr.maximum(wide, dr.minimum(wide * (SPACINGS / NARROWEST), 1)), wide)
 
 
-def _glow_in_proportion(glows, fluxes, flux):
-    """Return the glow of a light of ``flux`` (3,), as that of the strongest light that has one."""
+def _strongest(glows, fluxes):
+    """Return which light is the strongest of those that have a glow; None where none has one."""
     strength = [0.0 if glow is None else f @ LUMINANCE for glow, f in zip(glows, fluxes, strict=True)]
-    i = int(np.argmax(strength)) if strength else 0
-    if not strength or not strength[i] > 0:
-        return None
-    return glows[i] * (flux / np.maximum(fluxes[i], FAINTEST * fluxes[i].max()))
-
-
-def clear_glow(ratio: np.ndarray) -> np.ndarray:
-    """Return the glow (len(GLOW_DEGREES), 3) of a sun in a clear sky.
-
-    ``ratio`` (3,) is its flux over the irradiance of the ground by the sky.
-    """
-    ratio = np.minimum(ratio, MOST_GLOW)
-    table = CLEAR_GLOW * np.exp(-GLOW_DEGREES / CLEAR_GLOW_DEGREES)[:, None] * ratio
-    table[-1] = 0
-    return table
+    return int(np.argmax(strength)) if strength and max(strength) > 0 else None
 
 
 def _row(kind, values, i):
@@ -424,21 +412,6 @@ def _snapped(place, snap):
     """Move a place that is a whole number but for rounding onto it: 1e-5 of a sun is bright."""
     whole = dr.round(place)
     return dr.replace_grad(dr.select(dr.abs(place - whole) < snap, whole, place), place)
-
-
-def interpolated_glow(table: mi.Float, cosine: mi.Float) -> mi.Color3f:
-    """Interpolate a :attr:`.separation.Light.glow`, flat, at angles given by their cosines.
-
-    Level within the first of GLOW_DEGREES, 0 beyond the last.
-    """
-    step = float(GLOW_DEGREES[1])
-    last = len(GLOW_DEGREES) - 1
-    # The derivative of acos is infinite at 1: held off by less than the level part.
-    angle = dr.acos(dr.clip(cosine, -1 + 1e-6, 1 - 1e-6)) * (180 / math.pi / step)
-    node = dr.clip(mi.UInt32(angle), 0, last - 1)
-    part = angle - node
-    low, high = (dr.gather(mi.Color3f, table, node + k) for k in (0, 1))
-    return dr.select(angle < last, low + (high - low) * part, 0)
 
 
 class _Grid(NamedTuple):

@@ -57,6 +57,12 @@ _RINGS = np.concatenate(
     [[0, 1, 1.5], np.arange(2.0, 10), np.arange(10.0, 20, 2), np.arange(20.0, 121, 5)]
 )  # edges, degrees
 """Edges of the rings in which a glow is measured, degrees: finer near the light. Not measured."""
+SILHOUETTE_STEPS = 6
+"""How often the mean of the sky at an elevation is taken again without what is darker. Measured: with 12
+steps moved lights are as near to the truth."""
+LEAST_SKY = 1e-9
+"""Least weight of a texel among those of its elevation, where all others are silhouettes. Derived: of float64
+mean and weight keep seven digits."""
 MEDIAN_COLUMNS = 64
 """Columns of the grid on which the median of the surroundings is taken. Not measured."""
 RELAXATIONS = 30
@@ -397,12 +403,37 @@ def _glow(image: np.ndarray, small: _Small, cores: np.ndarray, centre: np.ndarra
     if table is None:
         return None
     glow = 1 + glow_at(table, small.directions @ centre)
-    weight = np.where(cores, 0, glow.mean(axis=2) ** -2.0)[..., None]
     faint = max(1e-6 * float(image.mean()), 1e-30)
-    total = np.maximum(weight.sum(axis=1, keepdims=True), 1e-30)
-    level = np.exp((weight * np.log(image / glow + faint)).sum(axis=1, keepdims=True) / total)
+    logs = np.log(image / glow + faint)
+    weight = sky_weight(logs, np.where(cores[..., None], 0, away_weight(glow)))
+    level = np.exp(mean_at_elevation(logs, weight))
     relative = _of_rings(image / level, small, cores, centre)
     return table if relative is None else relative
+
+
+def away_weight(glow: np.ndarray) -> np.ndarray:
+    """Return how much each texel says of the sky away from lights, (rows, W, 1); ``glow`` is (rows, W, 3)."""
+    return np.maximum(glow.mean(axis=2, keepdims=True) ** -2.0, 1e-30)
+
+
+def sky_weight(logs: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Return weights (rows, W, 1) of the sky at each elevation, for weights that do not know it.
+
+    A texel that is darker than the mean of its row is rather a roof or a tree than sky: its weight is
+    multiplied by the square of its luminance over the mean's. ``logs`` (rows, W, 3) is log radiance.
+    """
+    luminance = (logs @ LUMINANCE)[..., None]
+    of_sky = weight
+    for _ in range(SILHOUETTE_STEPS):
+        darker = np.minimum(luminance - mean_at_elevation(luminance, of_sky), 0)
+        of_sky = weight * np.maximum(np.exp(2 * darker), LEAST_SKY)
+    return of_sky
+
+
+def mean_at_elevation(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Return the weighted mean of each row of values (rows, W, n), (rows, 1, n)."""
+    total = np.maximum(weight.sum(axis=1, keepdims=True), 1e-30)
+    return (weight * values).sum(axis=1, keepdims=True) / total
 
 
 def _of_rings(image, small, cores, centre):

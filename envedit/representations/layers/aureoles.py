@@ -1,0 +1,166 @@
+"""The glow of a light, wherever the light is placed and however bright it is made.
+
+A glow G is measured as a factor of the sky around a light (``separation.py``). Of a light at direction d,
+with s times its flux, it is f(s) c(d) G:
+
+    f(s) = 2 s / (1 + s),    c(d) = M(d_0) / M(d),    M(d) = sum of G Y(B) over sum of G,
+
+where d_0 is where the light was, Y(B) the luminance of the background and the sums go over the texels around
+d. A glow is light of the sun that air has scattered. Before bright clouds or at a bright horizon it is
+therefore no brighter in itself, c. It is gone with its light, but of a brighter sun it is hardly brighter:
+on eight PureSky maps, whose suns have 0.06 to 25 times the irradiance of their skies, the glow at 10 degrees
+goes with the flux to the power of 0.12 (``python -m experiments natural.aureoles table``).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from envedit.core import latlong
+from envedit.core.arrays import tensor
+from envedit.core.color import LUMINANCE
+from envedit.representations.layers.separation import GLOW_DEGREES
+
+CLEAR_FLUX, CLEAR_GLOW, CLEAR_GLOW_DEGREES = 20.0, 15.0, 16.0
+"""A sun in a clear sky: its flux over the irradiance of the ground by the sky, and its glow, CLEAR_GLOW
+exp(-angle / CLEAR_GLOW_DEGREES). Measured on three PureSky maps with clear suns
+(``tests/oracle/test_lights.py`` compares them)."""
+NODES = 11
+"""Nodes of M along each side of a cube around the sphere: 11 degrees apart, less than a glow is wide.
+Derived."""
+SKY_COLUMNS = 64
+"""Columns of the copy of the background of which M is the mean: finer ones change nothing in means over
+glows. Derived."""
+LEAST_LEVEL = 0.1
+"""Least M, over that where the light was: a glow that leaves a bright horizon does not bleach the dark. Not
+measured."""
+
+
+def glow_strength(factor: Any) -> Any:
+    """Return f, what a glow is multiplied by where the flux of its light is; of NumPy and Dr.Jit."""
+    return 2 * factor / (1 + factor)
+
+
+def log_strength_slope(factor: np.ndarray) -> np.ndarray:
+    """Return d log f / d log s, 1 / (1 + s)."""
+    return 1 / (1 + factor)
+
+
+def clear_glow() -> np.ndarray:
+    """Return the glow (len(GLOW_DEGREES), 3) of a sun in a clear sky, of :data:`CLEAR_FLUX`."""
+    table = CLEAR_GLOW * np.exp(-GLOW_DEGREES / CLEAR_GLOW_DEGREES)[:, None] * np.ones(3)
+    table[-1] = 0
+    return table
+
+
+def ground_irradiance(sky: np.ndarray, rows: tuple[int, int]) -> float:
+    """Return the luminance of the irradiance of level ground by a sky (n, W, 3) without lights.
+
+    ``rows`` are its first row in the map, and the rows of the map; those below the horizon light nothing.
+    """
+    first, total = rows
+    polar = np.pi * np.arange(first, first + len(sky)) / max(total - 1, 1)
+    cosine = np.maximum(np.cos(polar), 0)
+    weight = latlong.lookup_solid_angles(total, sky.shape[1])[first : first + len(sky)] * cosine
+    return float(weight @ (sky.astype(np.float64) @ LUMINANCE).sum(axis=1))
+
+
+@dataclass(frozen=True)
+class Sky:
+    """A background in means over some degrees: ``luminance`` (n,) and ``omega`` (n,) at ``directions``."""
+
+    directions: np.ndarray  # (n, 3)
+    luminance: np.ndarray
+    omega: np.ndarray
+    irradiance: float  # of the ground, luminance
+
+    @classmethod
+    def of(cls, background: np.ndarray, rows: tuple[int, int]) -> Sky:
+        """Average a background (rows, W, 3); ``rows`` are its first row, and the rows of the map."""
+        first, total = rows
+        height, width, _ = background.shape
+        whole = np.zeros((total, width, 2), np.float32)
+        whole[first : first + height, :, 0] = background @ LUMINANCE
+        whole[first : first + height, :, 1] = 1
+        columns = min(SKY_COLUMNS, width)
+        lines = min(max(columns // 2, 3), total)
+        coarse = latlong.resize(whole, lines, columns).astype(np.float64).reshape(-1, 2)
+        known = coarse[:, 1] > 1e-6
+        return cls(
+            directions=latlong.directions(lines, columns).reshape(-1, 3)[known],
+            luminance=coarse[known, 0] / coarse[known, 1],
+            omega=np.repeat(latlong.solid_angles(lines, columns), columns)[known] * coarse[known, 1],
+            irradiance=ground_irradiance(background, rows),
+        )
+
+    def mean(self, glow: np.ndarray, toward: np.ndarray) -> np.ndarray:
+        """Return M (k,), the mean luminance under a glow (len(GLOW_DEGREES), 3) around directions (k, 3)."""
+        angle = np.degrees(np.arccos(np.clip(toward @ self.directions.T, -1, 1)))
+        weight = np.interp(angle, GLOW_DEGREES, glow @ LUMINANCE) * self.omega
+        return weight @ self.luminance / np.maximum(weight.sum(axis=1), 1e-30)
+
+
+class Aureole:
+    """The glow of one light on the device.
+
+    Parameters
+    ----------
+    glow : ndarray (len(GLOW_DEGREES), 3)
+        As of :class:`.separation.Light`.
+    home : ndarray (3,) or None
+        Where it has this glow; None: in a sky that is the same all around.
+    sky : Sky or None
+        The background that it brightens; None: c is 1.
+    """
+
+    def __init__(self, glow: np.ndarray, home: np.ndarray | None, sky: Sky | None):
+        self._table = dr.opaque(mi.Float(glow.astype(np.float32).ravel()))
+        self._log_level: mi.Texture3f | None = None
+        if sky is None or not sky.luminance.any():
+            return
+        at_home = sky.irradiance / math.pi if home is None else float(sky.mean(glow, home[None])[0])
+        if not at_home > 0:
+            return
+        side = np.linspace(-1, 1, NODES)
+        nodes = np.stack(np.meshgrid(side, side, side, indexing="ij"), axis=-1)[..., ::-1].reshape(-1, 3)
+        nodes = nodes / np.maximum(np.linalg.norm(nodes, axis=1, keepdims=True), 1e-30)
+        log_level = np.log(np.maximum(sky.mean(glow, nodes) / at_home, LEAST_LEVEL))
+        table = tensor(log_level.astype(np.float32).reshape(NODES, NODES, NODES, 1))
+        self._log_level = mi.Texture3f(table, use_accel=False)
+        # At home c is 1, and not what is interpolated between nodes.
+        self._log_at_home = dr.opaque(mi.Float, 0.0)
+        if home is not None:
+            self._log_at_home = dr.opaque(self._interpolated(mi.Vector3f(*home.tolist())))
+
+    def at(self, d: mi.Vector3f, centre: mi.Vector3f, factor: mi.Color3f) -> mi.Color3f:
+        """Return f c G at directions ``d`` of the light at ``centre``, ``factor`` times its flux."""
+        strength = glow_strength(factor)
+        if self._log_level is not None:
+            strength *= dr.exp(self._log_at_home - self._interpolated(centre))
+        return _interpolated_glow(self._table, dr.dot(d, centre)) * strength
+
+    def _interpolated(self, toward):
+        """Return log M at a direction, linearly between nodes."""
+        place = mi.Point3f(toward) * (0.5 * (NODES - 1) / NODES) + 0.5
+        return self._log_level.eval(place)[0]
+
+
+def _interpolated_glow(table, cosine):
+    """Interpolate a glow, flat, at angles given by their cosines.
+
+    Level within the first of GLOW_DEGREES, 0 beyond the last.
+    """
+    step = float(GLOW_DEGREES[1])
+    last = len(GLOW_DEGREES) - 1
+    # The derivative of acos is infinite at 1: held off by less than the level part.
+    angle = dr.acos(dr.clip(cosine, -1 + 1e-6, 1 - 1e-6)) * (180 / math.pi / step)
+    node = dr.clip(mi.UInt32(angle), 0, last - 1)
+    part = angle - node
+    low, high = (dr.gather(mi.Color3f, table, node + k) for k in (0, 1))
+    return dr.select(angle < last, low + (high - low) * part, 0)

@@ -165,12 +165,13 @@ class Lights:
             if strongest is not None:
                 own_flux = np.maximum(own[strongest], FAINTEST * own[strongest].max())
                 added = self.glows[strongest] * (spare / own_flux)
-        self.glows += [added] * SPARE
-        homes = [*self.centres[: self.own], *[None if strongest is None else self.centres[strongest]] * SPARE]
         self._aureoles = [
             None if glow is None else Aureole(glow, home, sky)
-            for glow, home in zip(self.glows, homes, strict=True)
+            for glow, home in zip(self.glows, self.centres, strict=False)
         ]
+        home = None if strongest is None else self.centres[strongest]
+        self.glows += [added] * SPARE
+        self._aureoles += [None if added is None else Aureole(added, home, sky)] * SPARE
 
     @property
     def glowing(self) -> bool:

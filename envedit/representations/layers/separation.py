@@ -57,9 +57,12 @@ _RINGS = np.concatenate(
     [[0, 1, 1.5], np.arange(2.0, 10), np.arange(10.0, 20, 2), np.arange(20.0, 121, 5)]
 )  # edges, degrees
 """Edges of the rings in which a glow is measured, degrees: finer near the light. Not measured."""
+SILHOUETTE = 0.5
+"""Share of the mean luminance at an elevation below which a texel is rather no sky. Measured: with 1 gaps
+between clouds count as roofs (``docs/decisions/sky_where_the_sun_was.md``)."""
 SILHOUETTE_STEPS = 6
-"""How often the mean of the sky at an elevation is taken again without what is darker. Measured: with 12
-steps moved lights are as near to the truth."""
+"""How often the mean of the sky at an elevation is taken again without silhouettes. Measured: with 12 steps
+moved lights are as near to the truth."""
 LEAST_SKY = 1e-9
 """Least weight of a texel among those of its elevation, where all others are silhouettes. Derived: of float64
 mean and weight keep seven digits."""
@@ -419,14 +422,15 @@ def away_weight(glow: np.ndarray) -> np.ndarray:
 def sky_weight(logs: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Return weights (rows, W, 1) of the sky at each elevation, for weights that do not know it.
 
-    A texel that is darker than the mean of its row is rather a roof or a tree than sky: its weight is
-    multiplied by the square of its luminance over the mean's. ``logs`` (rows, W, 3) is log radiance.
+    A texel of less than :data:`SILHOUETTE` of the mean of its row is rather a roof or a tree than sky: its
+    weight is multiplied by the fourth power of its luminance over that. ``logs`` (rows, W, 3) are of radiance.
     """
     luminance = (logs @ LUMINANCE)[..., None]
     of_sky = weight
     for _ in range(SILHOUETTE_STEPS):
-        darker = np.minimum(luminance - mean_at_elevation(luminance, of_sky), 0)
-        of_sky = weight * np.maximum(np.exp(2 * darker), LEAST_SKY)
+        limit = mean_at_elevation(luminance, of_sky) + np.log(SILHOUETTE)
+        darker = np.minimum(luminance - limit, 0)
+        of_sky = weight * np.maximum(np.exp(4 * darker), LEAST_SKY)
     return of_sky
 
 

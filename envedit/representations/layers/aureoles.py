@@ -3,7 +3,7 @@
 A glow G is measured as a factor of the sky around a light (``separation.py``). Of a light at direction d,
 with s times its flux, it is f(s) c(d) G:
 
-    f(s) = 2 s / (1 + s),    c(d) = M(d_0) / M(d),    M(d) = sum of G Y(B) over sum of G,
+    f(s) = 2 s / (1 + s),    c(d) = min(1, M(d_0) / M(d)),    M(d) = sum of G Y(B) over sum of G,
 
 where d_0 is where the light was, Y(B) the luminance of the background and the sums go over the texels around
 d. A glow is light of the sun that air has scattered. Before bright clouds or at a bright horizon it is
@@ -37,9 +37,6 @@ Derived."""
 SKY_COLUMNS = 64
 """Columns of the copy of the background of which M is the mean: finer ones change nothing in means over
 glows. Derived."""
-LEAST_LEVEL = 0.1
-"""Least M, over that where the light was: a glow that leaves a bright horizon does not bleach the dark. Not
-measured."""
 
 
 def glow_strength(factor: Any) -> Any:
@@ -130,10 +127,10 @@ class Aureole:
         side = np.linspace(-1, 1, NODES)
         nodes = np.stack(np.meshgrid(side, side, side, indexing="ij"), axis=-1)[..., ::-1].reshape(-1, 3)
         nodes = nodes / np.maximum(np.linalg.norm(nodes, axis=1, keepdims=True), 1e-30)
-        log_level = np.log(np.maximum(sky.mean(glow, nodes) / at_home, LEAST_LEVEL))
+        log_level = np.log(np.maximum(sky.mean(glow, nodes) / at_home, 1))
         table = tensor(log_level.astype(np.float32).reshape(NODES, NODES, NODES, 1))
         self._log_level = mi.Texture3f(table, use_accel=False)
-        # At home c is 1, and not what is interpolated between nodes.
+        # At home c is 1, whatever is interpolated there between nodes.
         self._log_at_home = dr.opaque(mi.Float, 0.0)
         if home is not None:
             self._log_at_home = dr.opaque(self._interpolated(mi.Vector3f(*home.tolist())))
@@ -142,7 +139,7 @@ class Aureole:
         """Return f c G at directions ``d`` of the light at ``centre``, ``factor`` times its flux."""
         strength = glow_strength(factor)
         if self._log_level is not None:
-            strength *= dr.exp(self._log_at_home - self._interpolated(centre))
+            strength *= dr.exp(dr.minimum(self._log_at_home - self._interpolated(centre), 0))
         return _interpolated_glow(self._table, dr.dot(d, centre)) * strength
 
     def _interpolated(self, toward):

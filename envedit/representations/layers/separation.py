@@ -423,7 +423,7 @@ def sky_weight(logs: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Return weights (rows, W, 1) of the sky at each elevation, for weights that do not know it.
 
     A texel of less than :data:`SILHOUETTE` of the mean of its row is rather a roof or a tree than sky: its
-    weight is multiplied by the fourth power of its luminance over that. ``logs`` (rows, W, 3) are of radiance.
+    weight is multiplied by the fourth power of its luminance over that. ``logs`` (rows, W, 3) are radiance's.
     """
     luminance = (logs @ LUMINANCE)[..., None]
     of_sky = weight

@@ -35,7 +35,7 @@ INDEPENDENT = 256
 """Residuals of a rendering that count as independent, per channel: neighbouring pixels err together."""
 STATEMENTS = 3.0
 """Independent values, per channel, that all paint together states."""
-PAINT_NOISE = 0.25
+PAINT_NOISE = 0.3
 """Largest standard error of paint, as a share of the change that it asks for: no map makes all of what is
 painted (``docs/decisions/experiment_painted_likelihood.md`` has what other values do)."""
 VISIBLE = 0.02

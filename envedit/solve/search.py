@@ -147,7 +147,9 @@ def _others(best, compared):
 def _unfollowed(problem, best, sigma):
     """Whether paint is followed so little that its noise is the largest there may be."""
     most = problem.likelihood.paint_noise
-    return most is not None and problem.likelihood.noise(best.point.residual, sigma) >= most
+    if most is None or most <= sigma:
+        return False
+    return problem.likelihood.noise(best.point.residual, sigma) >= most
 
 
 def _neighbours(problem, best, moves, sigma, after_step, steps, sky):

@@ -337,12 +337,12 @@ def test_without_a_glow_in_the_map_spare_lights_have_that_of_a_clear_sun(rng):
     own = [patch(rng, 4, 10)]
     sky = np.full((H, W, 3), 3.0 / np.pi)
     made = Lights(own, (0, H), W, background=sky)
-    assert made.flux[1] @ LUMINANCE == pytest.approx(20 * 3, rel=0.01)
+    assert made.flux[1] @ LUMINANCE == pytest.approx(40 * 3, rel=0.01)
     turn, flux, _ = (np.array(p) for p in place(made, flux=DARK))
     flux[1] = np.log(0.25)
     at = np.radians([10.0, 60.0, 130.0])
     d = mi.Vector3f(np.stack([np.sin(at), np.cos(at), 0 * at]).astype(np.float32))
-    expected = 1 + 15 * np.exp(-np.array([10, 60, np.inf]) / 16)[:, None] * np.full(3, 2 * 0.25 / 1.25)
+    expected = 1 + 26 * np.exp(-np.array([10, 60, np.inf]) / 15)[:, None] * np.full(3, 2 * 0.25 / 1.25)
     np.testing.assert_allclose(made.glow_of(1, single(turn), single(flux), d).numpy().T, expected, rtol=1e-2)
     for radiance in (0.0, 1e-300):
         made = Lights(own, (0, H), W, background=np.full((H, W, 3), radiance))
@@ -357,7 +357,7 @@ def test_the_glow_of_a_clear_sun_is_that_of_photographed_ones(name, data):
     strength = aureoles.glow_strength(flux / aureoles.CLEAR_FLUX)
     expected = (aureoles.clear_glow() * strength)[5:31] @ LUMINANCE
     ratio = made.lights.glows[0][5:31] @ LUMINANCE / expected
-    assert 0.5 < ratio.min() < 1 < ratio.max() < 1.6
+    assert 0.55 < ratio.min() < 1 < ratio.max() < 1.6
 
 
 @pytest.mark.parametrize(("there", "strength"), [(5.0, 1 / 5), (0.2, 1)])

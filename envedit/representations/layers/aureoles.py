@@ -9,7 +9,7 @@ where d_0 is where the light was, Y(B) the luminance of the background and the s
 d. A glow is light of the sun that air has scattered. Before bright clouds or at a bright horizon it is
 therefore no brighter in itself, c. It is gone with its light, but of a brighter sun it is hardly brighter:
 on eight PureSky maps, whose suns have 0.06 to 25 times the irradiance of their skies, the glow at 10 degrees
-goes with the flux to the power of 0.12 (``python -m experiments natural.aureoles table``).
+goes with the flux to the power of 0.12 (``python -m experiments natural.aureoles run``).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from envedit.core.arrays import tensor
 from envedit.core.color import LUMINANCE
 from envedit.representations.layers.separation import GLOW_DEGREES
 
-CLEAR_FLUX, CLEAR_GLOW, CLEAR_GLOW_DEGREES = 20.0, 15.0, 16.0
+CLEAR_FLUX, CLEAR_GLOW, CLEAR_GLOW_DEGREES = 40.0, 26.0, 15.0
 """A sun in a clear sky: its flux over the irradiance of the ground by the sky, and its glow, CLEAR_GLOW
 exp(-angle / CLEAR_GLOW_DEGREES). Measured on three PureSky maps with clear suns
 (``tests/oracle/test_lights.py`` compares them)."""

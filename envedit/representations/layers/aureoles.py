@@ -25,7 +25,7 @@ import numpy as np
 from envedit.core import latlong
 from envedit.core.arrays import tensor
 from envedit.core.color import LUMINANCE
-from envedit.representations.layers.separation import GLOW_DEGREES
+from envedit.representations.layers.separation import GLOW_DEGREES, coarse
 
 CLEAR_FLUX, CLEAR_GLOW, CLEAR_GLOW_DEGREES = 40.0, 26.0, 15.0
 """A sun in a clear sky: its flux over the irradiance of the ground by the sky, and its glow, CLEAR_GLOW
@@ -34,9 +34,6 @@ exp(-angle / CLEAR_GLOW_DEGREES). Measured on three PureSky maps with clear suns
 NODES = 11
 """Nodes of M along each side of a cube around the sphere: 11 degrees apart, less than a glow is wide.
 Derived."""
-SKY_COLUMNS = 64
-"""Columns of the copy of the background of which M is the mean: finer ones change nothing in means over
-glows. Derived."""
 
 
 def glow_strength(factor: Any) -> Any:
@@ -80,19 +77,11 @@ class Sky:
     @classmethod
     def of(cls, background: np.ndarray, rows: tuple[int, int]) -> Sky:
         """Average a background (rows, W, 3); ``rows`` are its first row, and the rows of the map."""
-        first, total = rows
-        height, width, _ = background.shape
-        whole = np.zeros((total, width, 2), np.float32)
-        whole[first : first + height, :, 0] = background @ LUMINANCE
-        whole[first : first + height, :, 1] = 1
-        columns = min(SKY_COLUMNS, width)
-        lines = min(max(columns // 2, 3), total)
-        coarse = latlong.resize(whole, lines, columns).astype(np.float64).reshape(-1, 2)
-        known = coarse[:, 1] > 1e-6
+        shape, known, luminance, omega = coarse(background @ LUMINANCE, *rows)
         return cls(
-            directions=latlong.directions(lines, columns).reshape(-1, 3)[known],
-            luminance=coarse[known, 0] / coarse[known, 1],
-            omega=np.repeat(latlong.solid_angles(lines, columns), columns)[known] * coarse[known, 1],
+            directions=latlong.directions(*shape).reshape(-1, 3)[known],
+            luminance=luminance,
+            omega=omega,
             irradiance=ground_irradiance(background, rows),
         )
 

@@ -66,8 +66,8 @@ moved lights are as near to the truth."""
 LEAST_SKY = 1e-9
 """Least weight of a texel among those of its elevation, where all others are silhouettes. Derived: of float64
 mean and weight keep seven digits."""
-MEDIAN_COLUMNS = 64
-"""Columns of the grid on which the median of the surroundings is taken. Not measured."""
+COARSE_COLUMNS = 64
+"""Columns of the grid on which medians of surroundings and means under a glow are taken. Not measured."""
 RELAXATIONS = 30
 """Steps of relaxation of a membrane at every level of its pyramid. Not measured."""
 
@@ -328,19 +328,32 @@ def _cut_off(part, lum, omega):
     return bool((lum[around] > AS_BRIGHT * mean).sum() > MOST_AS_BRIGHT * around.sum())
 
 
-def _local_median(lum, first, total):
-    """Median luminance, by solid angle, of the disc around every texel, found on a coarse grid."""
+def coarse(
+    lum: np.ndarray, first: int, total: int
+) -> tuple[tuple[int, int], np.ndarray, np.ndarray, np.ndarray]:
+    """Average luminance (rows, W) over some degrees, of rows from ``first`` of a map of ``total`` rows.
+
+    Returns rows and columns of the coarse map, which of its texels are known, (h * w,) bool, and of those the
+    luminance and the known part of the solid angle.
+    """
     height, width = lum.shape
-    w = min(MEDIAN_COLUMNS, width)
+    w = min(COARSE_COLUMNS, width)
     h = max(w // 2, 3)
     whole = np.zeros((total, width, 2), np.float32)
     whole[first : first + height, :, 0] = lum
     whole[first : first + height, :, 1] = 1
-    coarse = latlong.resize(whole, h, w).astype(np.float64).reshape(-1, 2)
-    known = coarse[:, 1] > 1e-6
-    value = coarse[known, 0] / coarse[known, 1]
+    small = latlong.resize(whole, h, w).astype(np.float64).reshape(-1, 2)
+    known = small[:, 1] > 1e-6
+    value = small[known, 0] / small[known, 1]
+    weight = np.repeat(latlong.solid_angles(h, w), w)[known] * small[known, 1]
+    return (h, w), known, value, weight
+
+
+def _local_median(lum, first, total):
+    """Median luminance, by solid angle, of the disc around every texel, found on a coarse grid."""
+    height, width = lum.shape
+    (h, w), known, value, weight = coarse(lum, first, total)
     d = latlong.directions(h, w).reshape(-1, 3)
-    weight = np.repeat(latlong.solid_angles(h, w), w)[known] * coarse[known, 1]
     order = np.argsort(value, kind="stable")
     value, weight, others = value[order], weight[order], d[known][order]
     median = np.zeros(len(d))

@@ -113,7 +113,7 @@ class ExactColumns:
         seed : int
             Seed of every random choice.
         keep : ndarray of int64, optional
-            Texels whose columns may not be given up for new ones; all by default.
+            Texels whose columns are given up for new ones last, the first of them last of all.
         blocks : int, optional
             Trace only so many blocks of pixels: enough to have all kernels, but no column to be used.
         """
@@ -164,20 +164,19 @@ class ExactColumns:
         return _first_place(pixel, self.capacity) + dr.gather(mi.UInt32, slots, texel)
 
     def _take_slots(self, fresh, texels, keep):
-        """Give slots to texels without one: new ones first, then those of columns that nobody keeps."""
+        """Give slots to texels without one: new ones first, then those of columns that are given up."""
         new = min(len(fresh), self.room)
         slots = len(self.texels) + np.arange(new)
-        self.texels = np.concatenate([self.texels, np.zeros(new, np.int64)])
         if new < len(fresh):
-            kept = np.zeros(self.grid.texels, bool)
-            kept[texels] = True
-            kept[self.texels[: len(self.texels) - new] if keep is None else keep] = True
-            older = np.arange(len(self.texels) - new)
-            given_up = older[~kept[self.texels[older]]][: len(fresh) - new]
+            kept = np.append(texels, [] if keep is None else keep).astype(np.int64)
+            rank = np.full(self.grid.texels, len(kept))
+            rank[kept[::-1]] = np.arange(len(kept))[::-1]  # of a texel that is listed twice, the first place
+            given_up = np.argsort(-rank[self.texels], kind="stable")[: len(fresh) - new]
             gone = self.texels[given_up]
             self.slot_of[gone] = -1
             self.paths_of[gone] = 0
             slots = np.concatenate([slots, given_up])
+        self.texels = np.concatenate([self.texels, np.zeros(new, np.int64)])
         self.texels[slots] = fresh
         self.slot_of[fresh] = slots
 

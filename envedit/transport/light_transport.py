@@ -104,7 +104,9 @@ class LightTransport:
         self.paths = plan.paths
         self.tolerance = plan.tolerance
         self._looks = np.zeros(grid.texels, np.uint8)
+        # Texels that were bright in the map that was resolved last; with those of maps before, last first
         self._bright: np.ndarray = np.zeros(0, np.int64)
+        self._recent: np.ndarray = np.zeros(0, np.int64)
         self._overview: overviews.Overview | None = None
         self._stored: tuple[DiskCache, dict[str, Any]] = DiskCache(None), {}
         self._exact = ExactColumns(scene, grid, plan.bounces, plan.capacity, plan.paths_bytes)
@@ -411,11 +413,10 @@ class LightTransport:
         order = np.argsort(-light, kind="stable")[:most]
         main = texels[order[light[order] > light.max(initial=0) * LEAST_LIGHT]]
         todo = main[exact.slot_of[main] < 0]
-        lasting = exact.texels[exact.paths_of[exact.texels] > self.paths[0]]
-        keep = np.union1d(main, np.union1d(lasting, self._bright))
-        todo = todo[: max(exact.capacity - len(np.setdiff1d(keep, todo)), 0)]
+        kept = np.union1d(main, self._bright)
+        todo = todo[: max(exact.capacity - len(np.setdiff1d(kept, todo)), 0)]
         if len(todo):
-            exact.trace(todo, self.paths[0], self.seed, keep)
+            exact.trace(todo, self.paths[0], self.seed, np.concatenate([main, self._recent]))
 
     def adjoint(self, image: mi.TensorXf | np.ndarray) -> mi.TensorXf:
         """Pull a picture (h, w, 3) back to the map: T' I, (H, W, 3); ValueError for another shape."""
@@ -456,10 +457,10 @@ class LightTransport:
     def state(self) -> dict:
         """Return what a checkpoint must hold.
 
-        The exact columns, their order and paths; looks, bright texels, which keep their columns; and epoch.
+        The exact columns, their order and paths; looks; bright texels, which keep their columns; and epoch.
         """
-        more = {"looks": self._looks, "bright": self._bright, "epoch": np.int64(self.epoch)}
-        return {**self._exact.state(), **more}
+        bright = {"bright": self._bright, "recent": self._recent}
+        return {**self._exact.state(), "looks": self._looks, **bright, "epoch": np.int64(self.epoch)}
 
     def restore(self, state: dict) -> None:
         """Trace the columns of an earlier :meth:`state`.
@@ -469,27 +470,25 @@ class LightTransport:
         InputError
             If it is no state of such a transport.
         """
-        columns, paths, bright = (np.asarray(state.get(name, 0)) for name in ("columns", "paths", "bright"))
         own = {k: np.asarray(v) for k, v in state.items()}
-        arrays = "columns", "paths", "looks", "bright"
+        arrays = "columns", "paths", "looks", "bright", "recent"
         kept = {name: (own[name].dtype, (None,)) for name in arrays if name in own}
         if not (
             own.keys() == {*arrays, "epoch"}
             and holds(own, kept | {"epoch": ("i8", ())})
             and all(a.dtype.kind in "iu" for a in own.values())
-            and len(columns) == len(paths) == len(np.unique(columns)) <= self.capacity
+            and len(own["columns"]) == len(own["paths"]) == len(np.unique(own["columns"])) <= self.capacity
             and len(own["looks"]) == self.grid.texels
             and 0 <= own["epoch"] < 2**31
-            and (len(columns) == 0 or 0 <= columns.min() <= columns.max() < self.grid.texels)
-            and (len(bright) == 0 or 0 <= bright.min() <= bright.max() < self.grid.texels)
-            and (len(paths) == 0 or 0 < paths.min() <= paths.max() <= max(*COLUMN_PATHS, *FEW_PATHS))
+            and all(_within(own[name], 0, self.grid.texels - 1) for name in ("columns", "bright", "recent"))
+            and _within(own["paths"], 1, max(*COLUMN_PATHS, *FEW_PATHS))
         ):
             raise InputError("checkpoint: its columns are not of this light transport; run without --resume")
         if int(state["epoch"]) != self.epoch:
             self.epoch = int(state["epoch"])
             self._record()
         self._looks = np.array(state["looks"], np.uint8)
-        self._bright = bright.astype(np.int64)
+        self._bright, self._recent = (own[name].astype(np.int64) for name in ("bright", "recent"))
         self._exact.restore(state, self.seed)
 
     def _apply(self, envmap, offset=True):
@@ -520,7 +519,7 @@ class LightTransport:
         texels = np.asarray(texels, np.int64)
         todo = texels[exact.slot_of[texels] < 0]
         if len(todo):
-            exact.trace(todo, self.paths[0], self.seed, texels)
+            exact.trace(todo, self.paths[0], self.seed, np.concatenate([texels, self._recent]))
         return exact.read(texels)
 
     def resolve(
@@ -549,13 +548,15 @@ class LightTransport:
         Returns
         -------
         int
-            Number of columns traced. Texels stay exact while there is room; then those that are not bright
-            any more make room for those that are.
+            Number of columns traced. Texels stay exact while there is room; then those make room that have
+            been bright in no map for longest.
         """
         require_unmasked(envmap, "light transport")
         envmap = np.asarray(envmap)
         exact = self._exact
         bright = self._bright = self.bright_texels(envmap, tolerance)[: exact.capacity]
+        before = self._recent[~np.isin(self._recent, bright)]
+        self._recent = np.concatenate([bright, before])[: exact.capacity]
         tier = np.searchsorted(COLUMN_SHARES, self._shares(envmap)[bright], side="left") - 1
         tier = np.maximum(tier, 0)
         if lasting is not None:
@@ -566,7 +567,7 @@ class LightTransport:
             todo = bright[(tier == i) & (exact.paths_of[bright] < self.paths[i])]
             todo = todo[: None if limit is None else limit - traced]
             if len(todo):
-                exact.trace(todo, self.paths[i], self.seed, bright)
+                exact.trace(todo, self.paths[i], self.seed, self._recent)
                 traced += len(todo)
         return traced
 
@@ -606,6 +607,11 @@ class LightTransport:
         tolerance = self.tolerance if tolerance is None else tolerance
         radiance, omega = self._radiance(envmap)
         return bright_texels.brightest(radiance, omega, self._samples, tolerance)
+
+
+def _within(numbers, least, most):
+    """Return whether all of some numbers, of which there may be none, are in a range."""
+    return bool(((least <= numbers) & (numbers <= most)).all())
 
 
 def _under(arrays, part):

@@ -233,6 +233,7 @@ def test_without_a_folder_nothing_is_kept(lit, tmp_path):
         {"looks": np.zeros(5, np.uint8)},
         {"bright": np.array([8 * 16])},
         {"bright": np.array([0.5])},
+        {"recent": np.array([8 * 16])},
         {"epoch": np.int64(-1)},
         {"epoch": np.int64(2**40)},
         {"more": np.zeros(1, int)},
@@ -241,7 +242,7 @@ def test_without_a_folder_nothing_is_kept(lit, tmp_path):
 def test_columns_of_a_checkpoint_are_checked(lit, tmp_path, odd):
     transport = build(tmp_path, lit)
     good = {"columns": np.array([3]), "paths": np.array([8]), "bright": np.array([3])}
-    good |= {"looks": np.zeros(8 * 16, np.uint8)}
+    good |= {"recent": np.array([3]), "looks": np.zeros(8 * 16, np.uint8)}
     transport.restore(good | {"epoch": np.int64(0)})
     assert transport.columns.tolist() == [3]
     for state in (good | {"epoch": np.int64(0)} | odd, good, {"epoch": np.int64(0)}):

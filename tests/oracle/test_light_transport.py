@@ -432,6 +432,21 @@ def test_capacity_is_never_exceeded(lamp_scene):
     assert np.isfinite(picture(none, sun(4, 0))).all() and np.isfinite(gradient).all()
 
 
+def test_columns_of_maps_that_were_bright_lately_stay_longest(lamp_scene):
+    """What is compared with a map that was rendered before keeps the columns that it was rendered with."""
+    pixels = lamp_scene.width * lamp_scene.height
+    t = build(lamp_scene, spp=32, memory_gb=(pixels * 32 * 1.5 * 32 + 5.5 * 16 * pixels) / 1e9)
+    assert t.capacity == 5
+    first, second, third = (row * WIDTH + np.array([4, 5]) for row in (2, 3, 4))
+    for texels in (first, second, first, third):
+        image = np.full((HEIGHT * WIDTH, 3), 1e-3, np.float32)
+        image[texels] = 1e4
+        t.resolve(image.reshape(HEIGHT, WIDTH, 3), tolerance=0.5)
+    assert set(first) | set(third) <= set(t.columns)
+    t.probe(np.array([9, 10, 11]) + WIDTH * 5)
+    assert set(third) <= set(t.columns)
+
+
 @pytest.mark.slow
 def test_same_seed_gives_the_same_bytes(lamp_scene):
     def run(seed):

@@ -763,7 +763,7 @@ class Session:
 
     def _differs(self, shown, saved):
         """Say by how much the rendering of the map that was saved differs from the one that was shown."""
-        self.transport.resolve(saved, limit=COLUMNS)
+        self.transport.resolve(np.maximum(shown, saved))  # the columns of one are not to displace the other's
         before, after = (tonemap(self.transport.apply(tensor(one)).numpy()) for one in (shown, saved))
         self.point = self.problem.evaluate(self.run.state)  # that has taken its columns
         change = np.abs(after - before)

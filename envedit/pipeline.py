@@ -31,8 +31,7 @@ from envedit.results import Result
 from envedit.scene.renderings import rendered
 from envedit.solve import adam_loop, adam_solver, feasibility, task
 from envedit.solve.edit_state import Interrupted, Stopped, Watch, keeping
-from envedit.solve.likelihood import sizes
-from envedit.solve.map_problem import SIGMA
+from envedit.solve.likelihood import SIGMA, sizes
 from envedit.targets import working_size
 from envedit.targets.target import Target
 from envedit.targets.target import make as make_target

@@ -7,10 +7,10 @@ units of its noise, by the logarithm of the background's texels. A pattern v of 
 
     F(v) = |J v|^2 = E_z[(v' J' z)^2],  z = +-1 at random in every pixel and channel,
 
-is more than a few. The patterns asked about alternate from node to node of an octave's grid within a small
-patch, so that what a coarser octave can say does not count. The noise of T would count too: a matte pixel's
-few hundred samples look like so many small mirrors. So the square is a product, of J' z through T and
-through a second, independent recording of it.
+is more than one for a contrast that would matter. The patterns asked about alternate from node to node of an
+octave's grid within a small patch, so that what a coarser octave can say does not count. The noise of T would
+count too: a matte pixel's few hundred samples look like so many small mirrors. So the square is a product, of
+J' z through T and through a second, independent recording of it.
 """
 
 from __future__ import annotations
@@ -22,20 +22,18 @@ from envedit.core import latlong
 from envedit.core.seeds import SIGNS
 from envedit.losses import display_curve
 from envedit.representations.layers.gain import Octave, grid_size, splines
+from envedit.solve.likelihood import SIGMA
 from envedit.transport.light_transport import LightTransport
 
 PROBES, FEW_PROBES = 12, 4
 """Random z; what is averaged over them, three patterns and the nodes of a patch is within a third. After the
 second number no more are drawn where the share is below half of what is asked for."""
-KNOWN_DISPLAY_ERROR = 0.01
-"""What a picture's display values are known to: its own noise and that of T together."""
-DETAIL_LOG_GAIN = 0.3
-"""Log gain of detail that would matter."""
-HALF_KNOWN_INFORMATION = 2.0
-"""The F of detail of that contrast at which it counts as half known: F_half of F^2 / (F^2 + F_half^2)."""
-FIRST_SHARE, LEAST_SHARE = 0.6, 0.02
-"""Shares of the sky's solid angle: below the first, no octave is returned; below the second, no further one.
-Whether detail is used is decided by :data:`.initialization.MIRRORED_SHARE` (0.8)."""
+HALF_KNOWN_LOG_GAIN = 0.1
+"""Contrast of detail, in log gain, that counts as half known where its F is 1: known is F^2 / (F^2 + 1)."""
+MIRRORED_SHARE, LEAST_SHARE = 0.8, 0.02
+"""Shares of the sky's solid angle in which detail must be identifiable: of the first octave, as in a mirror,
+and of further ones. In glossy scenes less of it is; there finer grids made maps worse (matpreview,
+principled: by 1 to 4 dB), with colours that no sky has."""
 
 
 def octaves(
@@ -67,11 +65,11 @@ def octaves(
     Returns
     -------
     list of Octave
-        Coarse to fine; ends before the first that is identifiable too little (:data:`FIRST_SHARE`,
+        Coarse to fine; ends before the first that is identifiable too little (:data:`MIRRORED_SHARE`,
         :data:`LEAST_SHARE`).
     """
     height, width, _ = background.shape
-    slope = display_curve.slope(picture) / KNOWN_DISPLAY_ERROR
+    slope = display_curve.slope(picture) / SIGMA
     if weight is not None:
         slope = slope * np.sqrt(weight)
     omega = latlong.solid_angles(rows[1], width)[rows[0] : rows[0] + height]
@@ -80,7 +78,7 @@ def octaves(
     while 2 * cycles <= width:
         size = grid_size(cycles, height / rows[1])
         down, across = splines(size, (height, width))
-        least = LEAST_SHARE if identified else FIRST_SHARE
+        least = LEAST_SHARE if identified else MIRRORED_SHARE
         around = down.T @ omega
         total = np.zeros(size)
         # Drawn anew for each octave: of a large map all of them together would take gigabytes.
@@ -88,8 +86,8 @@ def octaves(
             on_nodes = [np.einsum("yr,yxc,xk->rkc", down, a, across, optimize=True) for a in pair]
             total += _alternating(*on_nodes)
             # Where nothing is identifiable, a product of two estimates may well be negative.
-            mean = np.maximum(_smooth(total / drawn), 0) * DETAIL_LOG_GAIN**2
-            known = mean**2 / (mean**2 + HALF_KNOWN_INFORMATION**2)
+            information = np.maximum(_smooth(total / drawn), 0) * HALF_KNOWN_LOG_GAIN**2
+            known = information**2 / (information**2 + 1)
             share = float((known.mean(axis=1) * around).sum() / around.sum())
             if drawn >= FEW_PROBES and share < least / 2:
                 break

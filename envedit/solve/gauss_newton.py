@@ -15,7 +15,8 @@ import numpy as np
 
 from envedit.core.errors import NumericalError
 from envedit.solve.derivatives import NARROW_ANGLE, WIDE_ANGLE
-from envedit.solve.map_problem import SIGMA, Point, Posterior, Problem
+from envedit.solve.likelihood import SIGMA
+from envedit.solve.map_problem import Point, Posterior, Problem
 
 MOST_STEPS, LEAST_DECREASE = 16, 2e-3
 """Most steps, and the relative decrease of F below which no further step is made."""

@@ -25,9 +25,6 @@ from envedit.transport.light_transport import LightTransport
 
 SECOND_SPP, SECOND_COLUMNS = 32, 64
 """Most samples a pixel and exact columns of the second recording of T, which measures its noise."""
-MIRRORED_SHARE = 0.8
-"""Share of the sky whose detail must be identifiable, as in a mirror. In glossy scenes less is: there finer
-grids made maps worse (matpreview, principled: by 1 to 4 dB), with colours that no sky has."""
 
 
 @dataclass(frozen=True)
@@ -92,11 +89,8 @@ def recordings(
         2 * CYCLES,
     )
     shares = ", ".join(f"{100 * octave.share:.0f} % at {octave.cycles} cycles" for octave in octaves)
-    least = f"below {100 * gain_bandwidth.FIRST_SHARE:.0f} % at {2 * CYCLES} cycles"
+    least = f"below {100 * gain_bandwidth.MIRRORED_SHARE:.0f} % at {2 * CYCLES} cycles"
     notes = [f"sky area with identifiable detail: {shares or least}"]
-    if octaves and octaves[0].share < MIRRORED_SHARE:
-        octaves = []
-        notes[0] += f"; gain limited to {CYCLES} cycles ({100 * MIRRORED_SHARE:.0f} % needed)"
     if octaves and traced and settings.renderer.spp == "auto":
         most = recording.most_samples(pixels, recording.allowed(settings.renderer.memory_gb))
         if most > transport.spp:

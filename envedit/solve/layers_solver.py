@@ -21,7 +21,8 @@ from envedit.losses import display_curve
 from envedit.representations.layers.unseen import unseen_kept
 from envedit.solve import adam_loop, checkpoint, gauss_newton, hold, search, task, transport_error
 from envedit.solve.edit_state import EditState, Interrupted
-from envedit.solve.map_problem import SIGMA, Posterior
+from envedit.solve.likelihood import SIGMA
+from envedit.solve.map_problem import Posterior
 from envedit.transport.light_transport import LightTransport
 
 CHECKED_SPP = 64

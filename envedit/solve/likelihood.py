@@ -31,6 +31,9 @@ from envedit.core.arrays import tensor
 from envedit.core.color import brightest_shown
 from envedit.losses import display_curve
 
+SIGMA = 0.005
+"""Standard error of display values that a pixel is known to, where it was not measured. Measured: with twice
+of it thirty edits of ``experiments natural`` lose 0.2 dB of the rendering and 0.5 of the map."""
 INDEPENDENT = 256
 """Residuals of a rendering that count as independent, per channel: neighbouring pixels err together."""
 STATEMENTS = 3.0

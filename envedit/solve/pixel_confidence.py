@@ -12,9 +12,8 @@ import numpy as np
 from envedit.core.arrays import tensor
 from envedit.core.types import Views
 from envedit.losses.display_curve import to_display
+from envedit.solve.likelihood import SIGMA
 
-HALF_TRUSTED_ERROR = 0.007
-"""Standard error of display values, beyond what is usual in the picture, at which a pixel counts half."""
 AVERAGED_PIXELS = 2
 """Pixels to each side over which noise is averaged: paths that have hit nothing give no estimate."""
 NOISE_FLOOR_VARIANCES = 4.0
@@ -52,7 +51,7 @@ def weights(
     Returns
     -------
     ndarray (h, w, 1) or None
-        s^2 / (s^2 + v), s = :data:`HALF_TRUSTED_ERROR`, v the variance around a pixel beyond
+        s^2 / (s^2 + v), s = :data:`.likelihood.SIGMA`, v the variance around a pixel beyond
         :data:`NOISE_FLOOR_VARIANCES` times its median, and 0 at those over or beside
         :data:`LIGHT_BRIGHTNESS`; medians are over pixels that are :data:`LEAST_BRIGHTNESS`. None where no
         pixel is below 1/2, or none that is lit is above 0.
@@ -68,7 +67,7 @@ def weights(
     if not bright.any():
         return None
     beyond = np.maximum(around - NOISE_FLOOR_VARIANCES * np.median(around[bright]), 0)
-    trust = HALF_TRUSTED_ERROR**2 / (HALF_TRUSTED_ERROR**2 + beyond)
+    trust = SIGMA**2 / (SIGMA**2 + beyond)
     if trust.min() >= 0.5:
         return None
     brightest = np.concatenate([_windows(brightness[rows], 1).max(axis=(2, 3)) for rows in views])

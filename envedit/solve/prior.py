@@ -46,10 +46,9 @@ LEAST_WHOLE_FREEDOM = 0.25
 """Least freedom of one factor for the whole sky: photographs differ in exposure as their makers chose it."""
 LEAST_FREEDOM = 0.01
 """Freedom that 0 stands for: a gain that is the same everywhere, to a hundredth of how skies differ."""
-FIXED_PRECISION = 1e6
-"""Precision of grids that do not take part: their nodes stay at 0."""
-OWN_VARIANCE_SHARE = 1e-6
-"""Share of the variance at a node that is its own, so that nodes at one place differ."""
+LEAST_VARIANCE = 1e-6
+"""Variance of nodes of grids that do not take part: they stay at 0. And the share of the variance at a node
+that is its own, so that nodes at one place differ."""
 
 
 @dataclass(frozen=True)
@@ -96,9 +95,9 @@ class Prior:
         precisions = np.zeros((3, last + ground, last + ground))
         for precision, skies in zip(precisions, PHOTOGRAPHED, strict=True):
             covariance = skies.covariance(cosine, max(self.freedom, LEAST_FREEDOM), self.factor)
-            covariance[np.diag_indices_from(covariance)] *= 1 + OWN_VARIANCE_SHARE
+            covariance[np.diag_indices_from(covariance)] *= 1 + LEAST_VARIANCE
             precision[first:last, first:last] = np.linalg.inv(covariance)
-            precision[np.arange(first), np.arange(first)] = FIXED_PRECISION
+            precision[np.arange(first), np.arange(first)] = 1 / LEAST_VARIANCE
             precision[last:, last:] = (self.factor * skies.whole) ** -2.0
         return precisions
 

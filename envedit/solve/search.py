@@ -26,8 +26,8 @@ from envedit.core.rotations import rotation_vector
 from envedit.representations.layers.lights import DARK, LOBE_DEGREES
 from envedit.solve import gauss_newton, painted_places
 from envedit.solve.light_places import Places
-from envedit.solve.likelihood import INDEPENDENT
-from envedit.solve.map_problem import LARGEST_STEP, SIGMA, Problem
+from envedit.solve.likelihood import INDEPENDENT, SIGMA
+from envedit.solve.map_problem import LARGEST_STEP, Problem
 from envedit.solve.unknowns import Point, with_light
 
 MOVED, SOFTENED, REMOVED, ADDED = "moved", "softened", "removed", "light added"

@@ -8,8 +8,8 @@ from envedit import config
 from envedit.representations.layers.layers import Layers
 from envedit.solve import prior
 from envedit.solve.block_jacobian import BlockJacobian
-from envedit.solve.likelihood import Likelihood, on_average_one
-from envedit.solve.map_problem import SIGMA, Photographed, Problem
+from envedit.solve.likelihood import SIGMA, Likelihood, on_average_one
+from envedit.solve.map_problem import Photographed, Problem
 from envedit.targets.target import Target
 from envedit.transport.light_transport import LightTransport
 

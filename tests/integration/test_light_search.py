@@ -8,8 +8,8 @@ from envedit.core import latlong
 from envedit.representations.layers.layers import Layers
 from envedit.scene import scene
 from envedit.solve import gauss_newton, search
-from envedit.solve.likelihood import Likelihood, on_average_one
-from envedit.solve.map_problem import SIGMA, Problem
+from envedit.solve.likelihood import SIGMA, Likelihood, on_average_one
+from envedit.solve.map_problem import Problem
 from envedit.transport.light_transport import LightTransport
 
 pytestmark = pytest.mark.usefixtures("own_core")

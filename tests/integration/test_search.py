@@ -9,8 +9,8 @@ from envedit.representations.layers.layers import Layers
 from envedit.scene import scene
 from envedit.solve import search
 from envedit.solve.gauss_newton import Run
-from envedit.solve.likelihood import VISIBLE, Likelihood
-from envedit.solve.map_problem import SIGMA, Problem
+from envedit.solve.likelihood import SIGMA, VISIBLE, Likelihood
+from envedit.solve.map_problem import Problem
 from envedit.solve.prior import of_paint
 from envedit.targets.pixel_weights import FOLLOWING, pixel_weight
 from envedit.transport.light_transport import LightTransport

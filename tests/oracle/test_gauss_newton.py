@@ -20,7 +20,7 @@ from envedit.solve import checkpoint, gauss_newton, light_places, map_problem, s
 from envedit.solve.adam_loop import State
 from envedit.solve.derivatives import NARROW_ANGLE
 from envedit.solve.gauss_newton import Run, solve
-from envedit.solve.likelihood import Likelihood, on_average_one
+from envedit.solve.likelihood import SIGMA, Likelihood, on_average_one
 from envedit.solve.map_problem import Problem
 from envedit.solve.prior import PHOTOGRAPHED, Prior, of_paint
 from envedit.targets.pixel_weights import pixel_weight
@@ -494,14 +494,14 @@ def test_deviation_shrinks_with_what_is_known(rng):
         "twice": 2 * transport.weights[0],
     }.items():
         seen = DenseTransport(weights, FILM, GRID)
-        for sigma in (0.2, 0.02, map_problem.SIGMA):
+        for sigma in (0.2, 0.02, SIGMA):
             problem, params = problem_of(image, seen, shown(seen, image))
             start = problem.state(params)
             normal = problem.normal(problem.evaluate(start), start, sigma)
             found[name, sigma] = problem.posterior(start, normal).deviation
             assert (found[name, sigma] <= prior_deviation(problem) * (1 + 1e-4)).all(), (name, sigma)
     for name in ("half", "all", "twice"):
-        for more, less in ((map_problem.SIGMA, 0.02), (0.02, 0.2)):
+        for more, less in ((SIGMA, 0.02), (0.02, 0.2)):
             assert (found[name, more] <= found[name, less] * (1 + 1e-4)).all()
             assert found[name, more].mean() < 0.95 * found[name, less].mean()
     assert found["all", 0.02].mean() < found["half", 0.02].mean()
@@ -524,7 +524,7 @@ def followed(problem, params, **options):
     solution = solve(problem, params, after_step=note, **options)
     start = problem.state(params)
     before, scale = problem.evaluate(start), np.inf
-    sigma = options.get("sigma", map_problem.SIGMA)
+    sigma = options.get("sigma", SIGMA)
     for row, point in zip(solution.history, points, strict=False):
         f = problem.likelihood.misfit(point.residual, row["sigma"]) + problem.penalty(point.state, start)
         assert f == pytest.approx(row["loss"], rel=1e-9) == row["data"] + row["prior"]

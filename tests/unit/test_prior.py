@@ -93,7 +93,7 @@ def test_coarser_grids_stay_where_the_finest_has_all_and_ground_changes_as_a_sky
     found = prior.of_paint(0.25).gain_precisions(UPPER, ground=True)
     assert found.shape == (3, *(2 * [FIRST + len(UPPER.directions(2)) + 1]))
     for precision, skies in zip(found, PHOTOGRAPHED, strict=True):
-        np.testing.assert_array_equal(precision[:FIRST, :FIRST], prior.FIXED_PRECISION * np.eye(FIRST))
+        np.testing.assert_array_equal(precision[:FIRST, :FIRST], np.eye(FIRST) / prior.LEAST_VARIANCE)
         assert not precision[:FIRST, FIRST:].any() and not precision[-1, :-1].any()
         assert precision[-1, -1] == pytest.approx(whole(skies, 0.25) ** -2)
 

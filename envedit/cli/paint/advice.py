@@ -16,7 +16,8 @@ from envedit.losses import metrics
 from envedit.representations.layers.lights import DARK, LOBE_DEGREES
 from envedit.solve import painted_places
 from envedit.solve.feasibility import WARNED_SHARE, Reach
-from envedit.solve.map_problem import SIGMA, Problem
+from envedit.solve.likelihood import SIGMA
+from envedit.solve.map_problem import Problem
 from envedit.solve.unknowns import with_light
 
 UNLIT_SHARE = 0.02

@@ -49,7 +49,7 @@ from envedit.representations.layers.placed_lights import PlacedLights, angles
 from envedit.representations.layers.unseen import unseen_kept
 from envedit.scene.scene import Scene
 from envedit.solve import checkpoint, feasibility, gauss_newton, hold, map_problem, prior, search
-from envedit.solve.likelihood import Likelihood
+from envedit.solve.likelihood import SIGMA, Likelihood
 from envedit.solve.unknowns import with_light
 from envedit.targets import strokes, working_size
 from envedit.targets.pixel_weights import first_hold, pixel_weight
@@ -62,7 +62,7 @@ weights to read in every frame, and its errors cancel where nothing changes."""
 SHARPER = 2
 """Pixels of the rendering that is shown when idle, along an axis, for one of the picture that is edited."""
 PASS, FIRST_PASSES, PASSES = 16, 4, 16
-"""Samples a pixel of one pass of that rendering; passes before other starts are asked for, and in all."""
+"""Samples a pixel of one pass of that rendering; passes before feasibility is asked for, and in all."""
 MEMORY_EVERY_S = 10.0
 """Seconds of work after which freed buffers are given back: that takes 0.1 s, 1 % of the time."""
 SKY_WIDTH = 2048
@@ -362,19 +362,16 @@ class Session:
 
     def _worked(self):
         """Do a piece of work; False where there is none left."""
-        if not self.converged:
-            self._step()
-            return True
-        if self.phase != "done":
-            return False
         try:
+            if self._solved_further(settled=self.phase == "done"):
+                return True
+            if self.phase != "done":
+                return False
             if self._render(FIRST_PASSES):
                 return True
             if not self._recorded:  # paths, before the first light is dragged: that takes seconds
                 self._recorded = True
                 self._quick.resolve(self.point.edited, limit=COLUMNS)
-                return True
-            if self._searched_further():
                 return True
             if self.solving and self.reach is None:
                 self._reach()
@@ -386,12 +383,21 @@ class Session:
         except SupersededError:
             return True
 
-    def _searched_further(self):
-        """Try other lights, or give more weight to what was not painted; False where neither is due."""
-        if self.solving and not self.searched:
+    def _solved_further(self, settled):
+        """Make a step, try other lights or hold the rest more; False where nothing is due.
+
+        Other lights are tried once the paint is ``settled``, after as many steps as each of them is given.
+        """
+        if not self.solving:
+            return False
+        enough = self.converged or len(self.run.history) >= search.EXPLANATION_STEPS
+        if settled and enough and not self.searched:
             self._search()
-            return True
-        return self.solving and self._held_more()
+        elif not self.converged:
+            self._step()
+        else:
+            return settled and self._held_more()
+        return True
 
     @property
     def state(self) -> str:
@@ -428,7 +434,7 @@ class Session:
         A light that jumps, or that is added, is where no small step leads.
         """
         self._tell_doing("looking for other lights")
-        now = search.score(self.problem, self.run, self.point, map_problem.SIGMA)
+        now = search.score(self.problem, self.run, self.point, SIGMA)
         found = search.search(self.problem, self.still, after_step=self._unless_newer)
         self.searched = True
         if found.score < now - search.POSITIVE_EVIDENCE:
@@ -708,9 +714,8 @@ class Session:
         if self._dragged:
             self._aim(self.document)
         shown = self._adjusted(self._edited())
-        while not self.converged or self._searched_further():
-            if not self.converged:
-                self._step()
+        while self._solved_further(settled=True):
+            pass
         start = SOLUTION if self.solving else ""
         project.keep(self.document, start)
         self._kept = self.document

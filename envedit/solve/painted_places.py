@@ -13,7 +13,9 @@ import numpy as np
 
 from envedit.core import latlong
 from envedit.core.arrays import flat, tensor
+from envedit.core.rotations import rotation_vector
 from envedit.losses import display_curve
+from envedit.representations.layers.lights import LOBE_DEGREES
 from envedit.solve.light_places import PLACES_APART_COSINE, PLACES_REFINED, is_apart, lit_ground, probed
 from envedit.solve.likelihood import Likelihood, of_mean
 from envedit.solve.map_problem import Problem
@@ -22,26 +24,37 @@ OWN_FLUX_FACTORS = 2.0 ** np.arange(-2, 1.5, 0.5)
 """Fluxes that a light of the map is tried with elsewhere, over its own."""
 ADDED_FLUX_SHARES = 2.0 ** np.arange(-6, 1.5, 0.5)
 """Fluxes that an added light is tried with, as shares of the light in the picture."""
+LARGER_DEGREES = (2.0, 8.0)
+"""Radii of larger lights that are tried: what is painted into something smooth is as large as its image."""
 TRIAL_SPACINGS = (2, 1)
 """Distances in texels of the places that are tried around the best cell, one after the other."""
 
 
+@dataclass(frozen=True)
+class Place:
+    """A direction (3,), the log flux (3,) of a light there, over its own, and -2 log likelihood with it."""
+
+    direction: np.ndarray
+    log_flux: np.ndarray
+    unlikeliness: float
+    degrees: float = LOBE_DEGREES  # radius of a light that is added
+
+
 def best(
     problem: Problem, state: dict, k: int, sigma: float, away: np.ndarray | None = None
-) -> list[tuple[np.ndarray, np.ndarray, float]]:
-    """List where light ``k``, dark in a state, raises the likelihood most: direction, log flux (3,), -2 log.
+) -> list[list[Place]]:
+    """List where light ``k``, dark in a state, raises the likelihood most, each place with sizes of it.
 
     All cells of the sky are tried through the block transport, with several fluxes each, and texels around
-    the best ones through exact columns. Places are :data:`.light_places.PLACES_APART_COSINE` apart, also from
-    ``away``.
+    the best ones through exact columns. The best texels, which are :data:`.light_places.PLACES_APART_COSINE`
+    apart, also from ``away``, come first; then, of a light that is added, larger ones in the cells.
     """
     lights, blocks, likelihood = problem.layers.lights, problem.blocks, problem.likelihood
     point = problem.evaluate(state, resolve=False)
     _, directions = blocks.sky
     if point.residual is None or not len(directions):
         return []
-    own, flux = k < lights.own, lights.flux[k]
-    ground = lit_ground(problem, point)
+    trial = _Trial(problem, point, k, sigma)
     weight = blocks.summed(likelihood.weight)
     total = np.maximum(weight, 1e-30)
     compared = _Comparison(
@@ -52,40 +65,68 @@ def best(
         weight=weight[:, 0],
         share=blocks.summed(likelihood.share)[:, 0],
     )
-    factors, unlikeliness = compared.best(blocks.cells(ground).of(flux), own)
+    factors, unlikeliness = compared.best(blocks.cells(trial.ground).of(lights.flux[k]), trial.own)
     if away is not None:
         unlikeliness = np.where(directions @ away > PLACES_APART_COSINE, np.inf, unlikeliness)
-    lights_refined: list[tuple[np.ndarray, np.ndarray, float]] = []
+    places: list[list[Place]] = []
     for _ in range(PLACES_REFINED):
         at = int(np.argmin(unlikeliness))
         if not np.isfinite(unlikeliness[at]):
             break
         unlikeliness = np.where(directions @ directions[at] > PLACES_APART_COSINE, np.inf, unlikeliness)
-        direction, factor, least = _refined(problem, point, flux, own, directions[at], sigma, ground)
-        if is_apart(direction, [other for other, _, _ in lights_refined]):
-            lights_refined.append((direction, np.full(3, np.log(factor)), least))
-    return lights_refined
+        texel = trial.texel(directions[at])
+        if is_apart(texel.direction, [other[0].direction for other in places]):
+            larger = () if trial.own else LARGER_DEGREES
+            places.append([texel, *(trial.lobe(directions[at], degrees) for degrees in larger)])
+    return places
 
 
-def _refined(problem, point, flux, own, direction, sigma, ground):
-    """Look around a direction through exact columns; returns direction, factor of the flux, and -2 log."""
-    likelihood = problem.likelihood
-    height, width = problem.envmap.shape[:2]
-    compared = _Comparison(
-        likelihood=likelihood,
-        sigma=sigma,
-        before=point.rendering.reshape(-1, 3),
-        target=problem.picture.reshape(-1, 3),
-        weight=likelihood.weight.ravel(),
-        share=likelihood.share.ravel(),
-    )
-    row, column = (round(float(x)) for x in latlong.texel_position(direction, height, width))
-    for spacing in TRIAL_SPACINGS:
-        texels, pictures = probed(problem, row, column, flux, spacing, reach=1, ground=ground)
-        factors, unlikeliness = compared.best([tensor(one) for one in pictures.T], own)
-        at = int(np.argmin(unlikeliness))
-        row, column = divmod(int(texels[at]), width)
-    return latlong.directions(height, width)[row, column], factors[at], float(unlikeliness[at])
+class _Trial:
+    """A light in place of none, in the picture of a point."""
+
+    def __init__(self, problem, point, k, sigma):
+        self.problem, self.k = problem, k
+        self.own, self.flux = k < problem.layers.lights.own, problem.layers.lights.flux[k]
+        self.ground = lit_ground(problem, point)
+        self._compared = _Comparison(
+            likelihood=problem.likelihood,
+            sigma=sigma,
+            before=point.rendering.reshape(-1, 3),
+            target=problem.picture.reshape(-1, 3),
+            weight=problem.likelihood.weight.ravel(),
+            share=problem.likelihood.share.ravel(),
+        )
+
+    def texel(self, direction):
+        """Return the best texel around a direction, through exact columns."""
+        height, width = self.problem.envmap.shape[:2]
+        row, column = (round(float(x)) for x in latlong.texel_position(direction, height, width))
+        for spacing in TRIAL_SPACINGS:
+            texels, pictures = probed(
+                self.problem, row, column, self.flux, spacing, reach=1, ground=self.ground
+            )
+            factors, unlikeliness = self._best(pictures)
+            at = int(np.argmin(unlikeliness))
+            row, column = divmod(int(texels[at]), width)
+        direction = latlong.directions(height, width)[row, column]
+        return Place(direction, np.full(3, np.log(factors[at])), float(unlikeliness[at]))
+
+    def lobe(self, direction, degrees):
+        """Return the place of a lobe of some radius."""
+        layers = self.problem.layers
+        turn = rotation_vector(layers.lights.centres[self.k], direction)
+        placement = turn, np.zeros(3), layers.lights.log_size(degrees)
+        core = layers.lights.cores_of(self.k, [placement], layers.whole) * layers.changeable
+        picture = self.problem.transport.pictures(core, self.problem.rows, most=0)
+        if self.ground is not None:
+            light = layers.ground_light.irradiance(core[0, : layers.shape[0]])
+            picture += np.float32(light * self.ground)
+        factors, unlikeliness = self._best(picture.reshape(1, -1, 3))
+        return Place(direction, np.full(3, np.log(factors[0])), float(unlikeliness[0]), degrees)
+
+    def _best(self, pictures):
+        """Return the best factors of the flux of pictures (k, pixels, 3), and -2 log likelihood then."""
+        return self._compared.best([tensor(one) for one in pictures.T], self.own)
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from envedit.core.rotations import rotation_vector
-from envedit.representations.layers.lights import DARK, LOBE_DEGREES
+from envedit.representations.layers.lights import DARK
 from envedit.solve import gauss_newton, painted_places
 from envedit.solve.light_places import Places
 from envedit.solve.likelihood import INDEPENDENT, SIGMA
@@ -40,7 +40,7 @@ the edits of a turned and an unturned sky varies by 1 and by 10 between three se
 ADDED_LIGHT_COST = 2 * np.log(20.0)
 """What a light costs that the map does not have: one sky in twenty gets one."""
 
-EXPLANATION_STEPS = 5
+EXPLANATION_STEPS = 3
 """Most Gauss-Newton steps after which explanations are compared."""
 MOST_OTHERS = 3
 """Most explanations that are kept beside the likeliest."""
@@ -302,11 +302,12 @@ def _changes(problem, state, start, sigma):
         dark = with_light(state, k, flux=DARK)
         # ---- elsewhere
         away = problem.direction(state, k)
-        for direction, flux, unlikeliness in painted_places.best(problem, dark, k, sigma, away):
-            turn = rotation_vector(lights.centres[k], direction)
-            moved = with_light(state, k, turn=turn, flux=flux)
-            centre = with_light(start, k, turn=turn) if own else with_light(start, k, turn=turn, flux=flux)
-            yield k, MOVED, moved, centre, unlikeliness, 0.0
+        for sizes in painted_places.best(problem, dark, k, sigma, away):
+            placed, unlikeliness = _smallest(lights, k, sizes)
+            moved = with_light(state, k, **placed)
+            if own:
+                placed = {"turn": placed["turn"]}
+            yield k, MOVED, moved, with_light(start, k, **placed), unlikeliness, 0.0
         # ---- softer: a light of few texels cannot grow, as its texels would part; a lobe can
         if own and spare:
             flux = state["flux"][k] + np.log(lights.flux[k] / np.maximum(lights.flux[spare[0]], 1e-30))
@@ -319,14 +320,25 @@ def _changes(problem, state, start, sigma):
         if not own:
             yield k, REMOVED, dark, start, _unlikeliness(problem, dark, sigma), -ADDED_LIGHT_COST
 
-    # ---- one more
-    size = lights.log_size(LOBE_DEGREES)
+    # ---- one more, as large as it must be
     for k in spare[:1]:
-        for direction, flux, unlikeliness in painted_places.best(problem, state, k, sigma):
-            turn = rotation_vector(lights.centres[k], direction)
-            more = with_light(state, k, turn=turn, flux=flux, size=size)
-            centre = with_light(start, k, turn=turn, flux=flux, size=size)
+        for sizes in painted_places.best(problem, state, k, sigma):
+            placed, unlikeliness = _smallest(lights, k, sizes)
+            more, centre = (with_light(one, k, **placed) for one in (state, start))
             yield k, ADDED, more, centre, unlikeliness, ADDED_LIGHT_COST
+
+
+def _smallest(lights, k, sizes):
+    """Return what places light ``k`` as the smallest of some sizes that promises as much as the best one.
+
+    Turn, flux, and the size of an added light; and -2 log likelihood.
+    """
+    least = min(place.unlikeliness for place in sizes) + POSITIVE_EVIDENCE
+    there = next(place for place in sizes if place.unlikeliness <= least)
+    placed = {"turn": rotation_vector(lights.centres[k], there.direction), "flux": there.log_flux}
+    if k >= lights.own:
+        placed["size"] = lights.log_size(there.degrees)
+    return placed, there.unlikeliness
 
 
 def _unlikeliness(problem, state, sigma):

@@ -121,6 +121,27 @@ def test_the_new_shadow_alone_says_so_too(transport):
 
 
 @pytest.mark.slow
+def test_a_disc_painted_on_a_mirror_adds_a_light_as_large_as_its_image(tmp_path):
+    mirror = scene.load("mirror", PIXELS, PIXELS)
+    transport = LightTransport.build(mirror, HEIGHT, WIDTH, max_depth=4, few=True, folder=tmp_path)
+    image, place = sky(), (10, 40)
+    disc = image.copy()
+    disc[:ROWS][DIRECTIONS[:ROWS] @ DIRECTIONS[place] > np.cos(np.radians(15))] = 2.0
+    picture, coverage = painted(transport, image, disc, share=0.05)
+    problem, start = problem_of(transport, image, picture, coverage)
+    found, lights, _, _ = found_for(problem, start)
+    added = problem.layers.lights.own
+    assert found.name == "light added" and degrees(lights[added], DIRECTIONS[place]) < 10
+    radius = 0.5 * np.exp(found.run.state["size"][added, 0])
+    assert 4 < radius < 20, "a standard deviation"
+    left, asked = (
+        (coverage * np.abs(one - picture)).sum()
+        for one in (found.point.rendering, rendered(transport, image))
+    )
+    assert left < 0.6 * asked
+
+
+@pytest.mark.slow
 def test_light_painted_beside_light_that_holds_adds_a_light(transport):
     """A tenth of the picture, as a second sun would light it; the first sun's light is painted as it is.
 

@@ -235,12 +235,12 @@ def _best(problem, without, start, k, painted, away=None):
     ``without`` is a state where it is dark, ``start`` one with its size, ``away`` where it is not to be.
     """
     best: tuple[float, np.ndarray | None, float] = 0.0, None, 1.0
-    for toward, log_flux, _ in painted_places.best(problem, without, k, SIGMA, away):
-        turn = rotation_vector(problem.layers.lights.centres[k], toward)
-        rendering = problem.evaluate(with_light(start, k, turn=turn, flux=log_flux)).rendering
+    for there, *_ in painted_places.best(problem, without, k, SIGMA, away):
+        turn = rotation_vector(problem.layers.lights.centres[k], there.direction)
+        rendering = problem.evaluate(with_light(start, k, turn=turn, flux=there.log_flux)).rendering
         share = 0.0 if rendering is None else painted.reached(rendering)
         if share > best[0]:
-            best = share, toward, float(np.exp(log_flux[0]))
+            best = share, there.direction, float(np.exp(there.log_flux[0]))
     return best
 
 

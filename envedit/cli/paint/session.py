@@ -301,12 +301,15 @@ class Session:
 
     def _weigh(self):
         """Aim the solution at the paint, with the present weight of what was not painted."""
-        paint = self.project.settings.target.paint
-        self.weight = pixel_weight(self.coverage, self._hidden, paint, self.hold)
-        likelihood = Likelihood.of_paint(self.weight, self.coverage, self.base, self.target)
+        self.weight, likelihood = self._likelihood(self.hold)
         self.problem.expect(prior.of_paint(self.document.freedom, self.coverage))
         self.point = self.problem.aimed_at(self.target, likelihood, self.point)
         self.run, self._rendered = gauss_newton.Run(self.run.state, self.start), None
+
+    def _likelihood(self, hold):
+        """Return the weight of pixels where those without paint have one, and the likelihood of the paint."""
+        weight = pixel_weight(self.coverage, self._hidden, self.project.settings.target.paint, hold)
+        return weight, Likelihood.of_paint(weight, self.coverage, self.base, self.target)
 
     def _held_more(self):
         """Give more weight to what was not painted, if it has changed visibly, as an edit does."""
@@ -539,9 +542,7 @@ class Session:
             self._tell_doing("looking for a better place of the light")
             self._unless_newer()
             held, listed = self.problem.likelihood, picking.lights(self.placed, document)
-            paint = self.project.settings.target.paint
-            weight = pixel_weight(self.coverage, self._hidden, paint, first_hold(self._chosen))
-            likelihood = Likelihood.of_paint(weight, self.coverage, self.base, self.target)
+            _, likelihood = self._likelihood(first_hold(self._chosen))
             self.problem.aimed_at(self.target, likelihood, self.point)
             actions += advice.lights(self.problem, self.still, self.run.state, painted, listed, document)
             there = self.problem.evaluate(self.run.state)  # that has taken its columns

@@ -334,7 +334,7 @@ def _smallest(lights, k, sizes):
     Turn, flux, and the size of an added light; and -2 log likelihood.
     """
     least = min(place.unlikeliness for place in sizes) + POSITIVE_EVIDENCE
-    there = next(place for place in sizes if place.unlikeliness <= least)
+    there = next(place for place in sizes if not place.unlikeliness > least)  # the first where none is finite
     placed = {"turn": rotation_vector(lights.centres[k], there.direction), "flux": there.log_flux}
     if k >= lights.own:
         placed["size"] = lights.log_size(there.degrees)

@@ -26,6 +26,9 @@ ADDED_FLUX_SHARES = 2.0 ** np.arange(-6, 1.5, 0.5)
 """Fluxes that an added light is tried with, as shares of the light in the picture."""
 LARGER_DEGREES = (2.0, 8.0)
 """Radii of larger lights that are tried: what is painted into something smooth is as large as its image."""
+POSITIVE_EVIDENCE = 2.0
+"""By how much -2 log evidence must be lower for another explanation: "positive" evidence by Kass and Raftery
+(1995), below which it is "not worth more than a bare mention"."""
 TRIAL_SPACINGS = (2, 1)
 """Distances in texels of the places that are tried around the best cell, one after the other."""
 
@@ -40,14 +43,12 @@ class Place:
     degrees: float = LOBE_DEGREES  # radius of a light that is added
 
 
-def best(
-    problem: Problem, state: dict, k: int, sigma: float, away: np.ndarray | None = None
-) -> list[list[Place]]:
-    """List where light ``k``, dark in a state, raises the likelihood most, each place with sizes of it.
+def best(problem: Problem, state: dict, k: int, sigma: float, away: np.ndarray | None = None) -> list[Place]:
+    """List where light ``k``, dark in a state, raises the likelihood most.
 
     All cells of the sky are tried through the block transport, with several fluxes each, and texels around
-    the best ones through exact columns. The best texels, which are :data:`.light_places.PLACES_APART_COSINE`
-    apart, also from ``away``, come first; then, of a light that is added, larger ones in the cells.
+    the best ones through exact columns. Texels are :data:`.light_places.PLACES_APART_COSINE` apart, also from
+    ``away``. A light that is added is the smallest there that promises as much as the best one.
     """
     lights, blocks, likelihood = problem.layers.lights, problem.blocks, problem.likelihood
     point = problem.evaluate(state, resolve=False)
@@ -68,17 +69,25 @@ def best(
     factors, unlikeliness = compared.best(blocks.cells(trial.ground).of(lights.flux[k]), trial.own)
     if away is not None:
         unlikeliness = np.where(directions @ away > PLACES_APART_COSINE, np.inf, unlikeliness)
-    places: list[list[Place]] = []
+    places: list[Place] = []
+    texels: list[np.ndarray] = []
     for _ in range(PLACES_REFINED):
         at = int(np.argmin(unlikeliness))
         if not np.isfinite(unlikeliness[at]):
             break
         unlikeliness = np.where(directions @ directions[at] > PLACES_APART_COSINE, np.inf, unlikeliness)
         texel = trial.texel(directions[at])
-        if is_apart(texel.direction, [other[0].direction for other in places]):
+        if is_apart(texel.direction, texels):
+            texels.append(texel.direction)
             larger = () if trial.own else LARGER_DEGREES
-            places.append([texel, *(trial.lobe(directions[at], degrees) for degrees in larger)])
+            places.append(_smallest([texel, *(trial.lobe(directions[at], degrees) for degrees in larger)]))
     return places
+
+
+def _smallest(sizes):
+    """Return the first of places, by size, that promises as much as the best one."""
+    least = min(place.unlikeliness for place in sizes) + POSITIVE_EVIDENCE
+    return next(place for place in sizes if not place.unlikeliness > least)  # the first where none is finite
 
 
 class _Trial:

@@ -28,15 +28,14 @@ from envedit.solve import gauss_newton, painted_places
 from envedit.solve.light_places import Places
 from envedit.solve.likelihood import INDEPENDENT, SIGMA
 from envedit.solve.map_problem import LARGEST_STEP, Problem
+from envedit.solve.painted_places import POSITIVE_EVIDENCE
 from envedit.solve.unknowns import Point, with_light
 
 MOVED, SOFTENED, REMOVED, ADDED = "moved", "softened", "removed", "light added"
-POSITIVE_EVIDENCE = 2.0
-"""By how much -2 log evidence must be lower for another explanation: "positive" evidence by Kass and Raftery
-(1995), below which it is "not worth more than a bare mention"."""
 STRONG_EVIDENCE = 6.0
-"""The same where Mitsuba's renderings decide: "strong" evidence. By chance of their samples the difference of
-the edits of a turned and an unturned sky varies by 1 and by 10 between three seeds (statue, two skies)."""
+"""What :data:`.painted_places.POSITIVE_EVIDENCE` is, where Mitsuba's renderings decide: "strong" evidence. By
+chance of their samples the difference of the edits of a turned and an unturned sky varies by 1 and by 10
+between three seeds (statue, two skies)."""
 ADDED_LIGHT_COST = 2 * np.log(20.0)
 """What a light costs that the map does not have: one sky in twenty gets one."""
 
@@ -302,12 +301,11 @@ def _changes(problem, state, start, sigma):
         dark = with_light(state, k, flux=DARK)
         # ---- elsewhere
         away = problem.direction(state, k)
-        for sizes in painted_places.best(problem, dark, k, sigma, away):
-            placed, unlikeliness = _smallest(lights, k, sizes)
+        for there in painted_places.best(problem, dark, k, sigma, away):
+            placed = _placed(lights, k, there)
+            centre = {"turn": placed["turn"]} if own else placed
             moved = with_light(state, k, **placed)
-            if own:
-                placed = {"turn": placed["turn"]}
-            yield k, MOVED, moved, with_light(start, k, **placed), unlikeliness, 0.0
+            yield k, MOVED, moved, with_light(start, k, **centre), there.unlikeliness, 0.0
         # ---- softer: a light of few texels cannot grow, as its texels would part; a lobe can
         if own and spare:
             flux = state["flux"][k] + np.log(lights.flux[k] / np.maximum(lights.flux[spare[0]], 1e-30))
@@ -322,23 +320,16 @@ def _changes(problem, state, start, sigma):
 
     # ---- one more, as large as it must be
     for k in spare[:1]:
-        for sizes in painted_places.best(problem, state, k, sigma):
-            placed, unlikeliness = _smallest(lights, k, sizes)
+        for there in painted_places.best(problem, state, k, sigma):
+            placed = _placed(lights, k, there)
             more, centre = (with_light(one, k, **placed) for one in (state, start))
-            yield k, ADDED, more, centre, unlikeliness, ADDED_LIGHT_COST
+            yield k, ADDED, more, centre, there.unlikeliness, ADDED_LIGHT_COST
 
 
-def _smallest(lights, k, sizes):
-    """Return what places light ``k`` as the smallest of some sizes that promises as much as the best one.
-
-    Turn, flux, and the size of an added light; and -2 log likelihood.
-    """
-    least = min(place.unlikeliness for place in sizes) + POSITIVE_EVIDENCE
-    there = next(place for place in sizes if not place.unlikeliness > least)  # the first where none is finite
+def _placed(lights, k, there):
+    """Return the unknowns that put light ``k`` in a place; an added one has a size there."""
     placed = {"turn": rotation_vector(lights.centres[k], there.direction), "flux": there.log_flux}
-    if k >= lights.own:
-        placed["size"] = lights.log_size(there.degrees)
-    return placed, there.unlikeliness
+    return placed if k < lights.own else placed | {"size": lights.log_size(there.degrees)}
 
 
 def _unlikeliness(problem, state, sigma):

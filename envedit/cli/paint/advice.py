@@ -13,7 +13,7 @@ from envedit.cli.paint.protocol import Document
 from envedit.core.color import tonemap
 from envedit.core.rotations import rotation_vector
 from envedit.losses import metrics
-from envedit.representations.layers.lights import DARK, LOBE_DEGREES
+from envedit.representations.layers.lights import DARK
 from envedit.solve import painted_places
 from envedit.solve.feasibility import WARNED_SHARE, Reach
 from envedit.solve.likelihood import SIGMA
@@ -214,34 +214,36 @@ def _placed(problem, start, state, painted, listed, document):
     if i is not None:
         dark = with_light(start, strongest, flux=DARK)
         away = problem.direction(state, strongest)
-        share, toward, factor = _best(problem, dark, start, strongest, painted, away)
-        if toward is not None:
-            flux = [factor * value for value in listed[i].entry["flux"]]
-            moved = {"flux": flux} | picking.place(toward, document)
+        share, there = _best(problem, dark, start, strongest, painted, away)
+        if there is not None:
+            flux = [float(np.exp(there.log_flux[0])) * value for value in listed[i].entry["flux"]]
+            moved = {"flux": flux} | picking.place(there.direction, document)
             yield share, f"Drag light {i + 1}", picking.changed(listed, i, moved, document)
     # ---- One more
-    spare, size = layers.own, layers.log_size(LOBE_DEGREES)
-    lobe = with_light(start, spare, size=size)
-    share, toward, factor = _best(problem, start, lobe, spare, painted)
-    if toward is not None:
-        flux = (factor * layers.flux[spare]).tolist()
-        added = {"flux": flux, "size": LOBE_DEGREES} | picking.place(toward, document)
+    spare = layers.own
+    share, there = _best(problem, start, start, spare, painted)
+    if there is not None:
+        flux = (np.exp(there.log_flux) * layers.flux[spare]).tolist()
+        added = {"flux": flux, "size": there.degrees} | picking.place(there.direction, document)
         yield share, "Add a light", [*document.lights, added]
 
 
 def _best(problem, without, start, k, painted, away=None):
-    """Return what a light reaches at most, where, and the factor of its flux; None where it reaches nothing.
+    """Return what a light reaches at most, and its place; None where it reaches nothing.
 
-    ``without`` is a state where it is dark, ``start`` one with its size, ``away`` where it is not to be.
+    ``without`` is a state where it is dark, ``start`` the map's, ``away`` where it is not to be.
     """
-    best: tuple[float, np.ndarray | None, float] = 0.0, None, 1.0
-    for there, *_ in painted_places.best(problem, without, k, SIGMA, away):
-        turn = rotation_vector(problem.layers.lights.centres[k], there.direction)
-        rendering = problem.evaluate(with_light(start, k, turn=turn, flux=there.log_flux)).rendering
+    lights = problem.layers.lights
+    most: tuple[float, painted_places.Place | None] = 0.0, None
+    for there in painted_places.best(problem, without, k, SIGMA, away):
+        turn = rotation_vector(lights.centres[k], there.direction)
+        size = start["size"][k] if k < lights.own else lights.log_size(there.degrees)
+        placed = with_light(start, k, turn=turn, flux=there.log_flux, size=size)
+        rendering = problem.evaluate(placed).rendering
         share = 0.0 if rendering is None else painted.reached(rendering)
-        if share > best[0]:
-            best = share, there.direction, float(np.exp(there.log_flux[0]))
-    return best
+        if share > most[0]:
+            most = share, there
+    return most
 
 
 def _percent(share):

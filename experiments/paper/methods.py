@@ -44,13 +44,15 @@ def _siren(title, regularised, **fit):
     return Method(title, {"representation": {"kind": "siren"}, "fit": fit, "loss": loss})
 
 
-def _plain(title, kind):
-    return Method(title, {"representation": {"kind": kind}, "loss": NO_REGULARISERS})
+def _plain(title, kind, loss=NO_REGULARISERS):
+    return Method(title, {"representation": {"kind": kind}, "loss": loss})
 
 
 METHODS = {
     "pixels": _plain("Pixels", "pixels"),
+    "pixels-reg": _plain("Pixels + L_reg", "pixels", loss=REGULARISERS),
     "log-pixels": _plain("Log(Pixels)", "log-pixels"),
+    "log-pixels-reg": _plain("Log(Pixels) + L_reg", "log-pixels", loss=REGULARISERS),
     "siren-no-hdr": _siren("SIREN HDR w/o L_hdr", False, hdr=0.0, awp_gamma=0.0),
     "siren": _siren("SIREN HDR", False, awp_gamma=0.0),
     "siren-reg": _siren("SIREN HDR + L_reg", True, awp_gamma=0.0),

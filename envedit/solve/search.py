@@ -8,8 +8,8 @@ number, -2 log evidence in Laplace's approximation (MacKay 1992),
     F(x) + 6 n log(sigma) + log det H - log det K,
 
 with sigma the most likely noise, n of ``likelihood.py``, H = K + the misfit's Hessian / 2. What an unknown
-gains in misfit it pays for by how far it is determined beyond its prior. The best explanation is kept if its
-number is lower by :data:`POSITIVE_EVIDENCE`, and the search goes on from there.
+gains in misfit it pays for by how far it is determined beyond its prior. The likeliest is kept, and the search
+goes on from there.
 
 Under a rendered target all of the sky may have changed: where a light promises most is asked beside what the
 sky can do (``light_places.py``). Of paint lights come first: it is asked under the sky of the original.
@@ -33,9 +33,9 @@ from envedit.solve.unknowns import Point, with_light
 
 MOVED, SOFTENED, REMOVED, ADDED = "moved", "softened", "removed", "light added"
 STRONG_EVIDENCE = 6.0
-"""What :data:`.painted_places.POSITIVE_EVIDENCE` is, where Mitsuba's renderings decide: "strong" evidence. By
-chance of their samples the difference of the edits of a turned and an unturned sky varies by 1 and by 10
-between three seeds (statue, two skies)."""
+"""By how much -2 log evidence must be lower where Mitsuba's renderings decide: "strong" evidence by Kass and
+Raftery (1995). By chance of their samples the difference of the edits of a turned and an unturned sky varies
+by 1 and by 10 between three seeds (statue, two skies)."""
 ADDED_LIGHT_COST = 2 * np.log(20.0)
 """What a light costs that the map does not have: one sky in twenty gets one."""
 
@@ -131,7 +131,7 @@ def further(
 def _likelier(best, explanations):
     """Return the likeliest of some explanations if it is likelier than the best so far, else None."""
     likeliest = min([best, *explanations], key=lambda one: one.score)
-    return likeliest if likeliest.score < best.score - POSITIVE_EVIDENCE else None
+    return likeliest if likeliest.score < best.score else None
 
 
 def _others(best, compared):

@@ -440,7 +440,7 @@ class Session:
         now = search.score(self.problem, self.run, self.point, SIGMA)
         found = search.search(self.problem, self.still, after_step=self._unless_newer)
         self.searched = True
-        if found.score < now - search.POSITIVE_EVIDENCE:
+        if found.score < now:
             self.run, self.start = found.run, found.run.start
             self._rendered = None
         self.point = self.problem.evaluate(self.run.state)  # others may have taken its columns

@@ -27,8 +27,8 @@ ADDED_FLUX_SHARES = 2.0 ** np.arange(-6, 1.5, 0.5)
 LARGER_DEGREES = (2.0, 8.0)
 """Radii of larger lights that are tried: what is painted into something smooth is as large as its image."""
 POSITIVE_EVIDENCE = 2.0
-"""Difference of -2 log likelihood up to which two places promise as much as each other: "not worth more than a
-bare mention" (Kass and Raftery 1995)."""
+"""Difference of -2 log likelihood up to which two places promise as much as each other: "not worth more than
+a bare mention" (Kass and Raftery 1995)."""
 TRIAL_SPACINGS = (2, 1)
 """Distances in texels of the places that are tried around the best cell, one after the other."""
 

@@ -8,8 +8,8 @@ number, -2 log evidence in Laplace's approximation (MacKay 1992),
     F(x) + 6 n log(sigma) + log det H - log det K,
 
 with sigma the most likely noise, n of ``likelihood.py``, H = K + the misfit's Hessian / 2. What an unknown
-gains in misfit it pays for by how far it is determined beyond its prior. The likeliest is kept, and the search
-goes on from there.
+gains in misfit it pays for by how far it is determined beyond its prior. The likeliest is kept, and the
+search goes on from there.
 
 Under a rendered target all of the sky may have changed: where a light promises most is asked beside what the
 sky can do (``light_places.py``). Of paint lights come first: it is asked under the sky of the original.

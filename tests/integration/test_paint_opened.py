@@ -74,7 +74,7 @@ def test_save_goes_on_from_what_is_shown_and_tells_what_differs(tmp_path):
         assert not any("start " in note for note in again.notes), "another start was chosen"
     with served(kept) as server, connected(server) as page:
         heard(page, "opened")
-        hold = server.worker.session.hold
+        hold = server.worker.session.solution.hold
         assert hold == FOLLOWING, "the saved solution is not what is opened"
         page.send(json.dumps({"type": "document", "number": 2, "document": {"strokes": [erased, erased]}}))
         heard(page, "status", lambda m: m.get("number") == 2)
@@ -98,8 +98,9 @@ def test_strokes_belong_to_the_view_that_was_painted_in_and_others_hold(tmp_path
             count += 1
             page.send(json.dumps({"type": "document", "number": count, "document": {"strokes": strokes}}))
             heard(page, "status", lambda m: m.get("number") == count and m["state"] == "done")
-            under = session.coverage
-            changes = session.target - session.base, under * (session.target - session.point.rendering)
+            now = session.solution
+            under = now.coverage
+            changes = now.target - now.base, under * (now.target - now.point.rendering)
             return [change[rows] for change in changes for rows in session.scene.rows]
 
         front, behind, _, _ = painted({**shadow, "view": 1})

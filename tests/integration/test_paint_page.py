@@ -544,11 +544,11 @@ def regions_are_painted(page, kept, session):
     orientation = Orientation(0, 12, 5)
     start = angles(orientation.matrix @ direction(*region["points"][0]))
     assert start == pytest.approx((108, 36), abs=0.5), "the brush is not where the pointer was"
-    until(lambda: session.kept is not None and session.kept.max() == 1)
+    until(lambda: session.solution.kept is not None and session.solution.kept.max() == 1)
     get("region-action").select_option("scale")
     get("region-stops").fill("-2")
     get("region-stops").press("Enter")
-    until(lambda: regions()[0].get("factor") == [0.25] * 3 and session.kept is None)
+    until(lambda: regions()[0].get("factor") == [0.25] * 3 and session.solution.kept is None)
     get("region-1").click()  # none is chosen: what comes next is another one
     get("region-action").select_option("keep")
     get("region-radius").fill("0")

@@ -61,10 +61,11 @@ def test_freedom_and_the_rest_are_solved_for_anew_and_kept(painting):
     gains, blocks = [], None
     for freedom in (1.0, 0.0):
         solved(painting, "drawing", strokes=[ERASED], freedom=freedom)
-        finest, last = np.prod(session.problem.sizes[-1]), session.problem.nodes - session.problem.ground
-        gains.append(session.run.state["gain"][last - finest : last].std(axis=0).max())
-        assert blocks in (None, session.problem.blocks), "blocks were built anew"
-        blocks = session.problem.blocks
+        problem, state = session.solution.problem, session.solution.run.state
+        finest, last = np.prod(problem.sizes[-1]), problem.nodes - problem.ground
+        gains.append(state["gain"][last - finest : last].std(axis=0).max())
+        assert blocks in (None, problem.blocks), "blocks were built anew"
+        blocks = problem.blocks
     assert gains[1] < 0.2 * gains[0], gains
     assert "freedom" not in session.project.text(session.project.document)
 
@@ -74,7 +75,9 @@ def test_freedom_and_the_rest_are_solved_for_anew_and_kept(painting):
         assert ("hold" in status) == (rest == "keep")
         assert 0 < status["reached"] <= status["reachable"] <= 1
         assert "advice" not in status or status["reached"] < 0.5
-        changes.append(np.abs(session.point.rendering - session.base)[session.coverage[..., 0] == 0].mean())
+        solution = session.solution
+        bare = solution.coverage[..., 0] == 0
+        changes.append(np.abs(solution.point.rendering - solution.base)[bare].mean())
     assert changes[1] < changes[0], "the rest does not stay"
     kept = config.load(session.project.folder / "painted.toml")
     assert (kept.target.rest, kept.solve.freedom) == ("keep", 0.0)
@@ -92,12 +95,12 @@ def test_advice_is_given_where_little_is_reached(painting):
     assert told["text"].startswith("stroke 1 (shadow) stays too bright") and "which stays" in told["text"]
     follow, *placed = told["actions"]
     assert follow["change"] == {"rest": "follow"} and placed
-    asked = session._asked
+    asked = session.solution.request
     for action in placed:  # what is promised is what comes
         promised = float(re.search(r"(\d+) %", action["label"])[1]) / 100
         assert promised > status["reached"]
         session.update(Edit(document(action["change"])))
-        assert asked.reached(session.base) == pytest.approx(promised, abs=0.1), action
+        assert asked.reached(session.solution.base) == pytest.approx(promised, abs=0.1), action
 
 
 def test_other_explanations_are_shown_and_gone_on_from(painting):
@@ -106,18 +109,18 @@ def test_other_explanations_are_shown_and_gone_on_from(painting):
     listed = heard.last["explanations"]["explanations"]
     assert len(listed) > 1 and heard.last["explanations"]["chosen"] == 0
     assert len({one["name"] for one in listed}) == len(listed)
-    first = {name: value.copy() for name, value in session.run.state.items()}
+    first = {name: value.copy() for name, value in session.solution.run.state.items()}
 
     session.choose(1)
     assert heard.last["explanations"]["chosen"] == 1
     while session.advance():
         pass
-    other = session.point.rendering
+    other = session.solution.point.rendering
     assert heard.last["status"]["reached"] != reached
-    assert np.abs(other - session.base).max() > 0.01
+    assert np.abs(other - session.solution.base).max() > 0.01
 
     session.choose(0)  # as it was left
-    assert all(np.array_equal(session.run.state[name], first[name]) for name in first)
+    assert all(np.array_equal(session.solution.run.state[name], first[name]) for name in first)
     session.choose(len(listed))  # of what was painted before
     assert heard.last["explanations"]["chosen"] == 0
     solved(painting)
@@ -134,7 +137,7 @@ def test_a_shadow_is_dragged_by_its_tip(painting):
     for turn, (tip, there) in DRAGGED.items():
         level = {"rotate_degrees": turn, "tilt_degrees": 3.0}
         session.update(Edit(document(level)))
-        before = session.base[:, :, 1].copy()
+        before = session.solution.base[:, :, 1].copy()
         ((sun, share),) = picked(45, 45, of="shares")["shares"]
         ((_, shaded),) = picked(*tip, of="shares")["shares"]
         assert sun == 0 and 0.3 < share < 1 and shaded < 0.1, "whose light it is"
@@ -143,7 +146,7 @@ def test_a_shadow_is_dragged_by_its_tip(painting):
         to = picked(*there, light=0, point=tuple(found["point"]))
         light = {"light": 1, "azimuth": to["azimuth"], "elevation": to["elevation"]}
         session.update(Edit(document(level | {"lights": [light]})))
-        after = session.base[:, :, 1]
+        after = session.solution.base[:, :, 1]
         assert after[there] < 0.5 * before[there], "the shadow is not where it was dragged to"
         assert after[tip] > before[tip]
         assert "in no shadow" in picked(45, 45)["text"]
@@ -151,11 +154,12 @@ def test_a_shadow_is_dragged_by_its_tip(painting):
         to = picked(*tip, of="cast")
         light |= {"azimuth": to["azimuth"], "elevation": to["elevation"]}
         session.update(Edit(document(level | {"lights": [light]})))
-        assert to["light"] == 0 and session.base[tip][1] < 0.5 * after[tip], "the shadow does not fall there"
+        assert to["light"] == 0
+        assert session.solution.base[tip][1] < 0.5 * after[tip], "the shadow does not fall there"
         added = picked(20, 24, of="illuminate")
         assert added["light"] == -1 and -90 <= added["elevation"] <= 90
-        lights = session.problem.layers.lights
-        session.run.state["turn"][0] = rotation_vector(lights.centres[0], lights.centres[0] * [-1, 1, -1])
+        centre = session.solution.problem.layers.lights.centres[0]
+        session.solution.run.state["turn"][0] = rotation_vector(centre, centre * [-1, 1, -1])
         assert "in no shadow" in picked(*there)["text"], "the light is not where paint has put it"
         assert "no shadow was picked" in picked(45, 45, light=0)["text"]
 

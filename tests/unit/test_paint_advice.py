@@ -7,6 +7,7 @@ import pytest
 
 from envedit.cli.paint import advice
 from envedit.cli.paint.protocol import document
+from envedit.cli.paint.solution import Request
 from envedit.core.color import tonemap
 
 SHAPE = 8, 8, 3
@@ -27,7 +28,7 @@ def told(feasible, target=0.2, white=1.0, lamps=0.0, **chosen):
         share=feasible if np.isscalar(feasible) else 0.3,
     )
     made = document({"strokes": [SQUARE, HELD], **chosen})
-    painted = advice.Painted(base, wanted, cover)
+    painted = Request(base, wanted, cover)
     light = advice.Light(lit, np.full(SHAPE, lamps))
     return advice.said(made, painted, base, reach, [cover, cover], light)
 

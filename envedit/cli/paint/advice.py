@@ -10,9 +10,9 @@ import numpy as np
 
 from envedit.cli.paint import picking
 from envedit.cli.paint.protocol import Document
+from envedit.cli.paint.solution import Request
 from envedit.core.color import tonemap
 from envedit.core.rotations import rotation_vector
-from envedit.losses import metrics
 from envedit.representations.layers.lights import DARK
 from envedit.solve import painted_places
 from envedit.solve.feasibility import WARNED_SHARE, Reach
@@ -28,34 +28,6 @@ UNEVEN_SHARE = 0.3
 pattern is not. Not measured."""
 MOST_NAMED = 3
 """Strokes that are named."""
-
-
-@dataclass(frozen=True)
-class Painted:
-    """What was painted.
-
-    Attributes
-    ----------
-    base, target : ndarray (h, w, 3)
-        What was painted on, and what was asked for, linear radiance.
-    coverage : ndarray (h, w, 1)
-        How much each pixel was painted; 0 of those that do not count.
-    """
-
-    base: np.ndarray
-    target: np.ndarray
-    coverage: np.ndarray
-
-    def reached(self, rendering: np.ndarray) -> float:
-        """Return the share of the painted change that a rendering has made; 1 where nothing is asked."""
-        towards = metrics.painted(rendering, self.target, self.base, self.coverage)["towards"]
-        return 1.0 if towards is None else towards
-
-    def of_stroke(self, picture: np.ndarray, cover: np.ndarray) -> float:
-        """Return the share of one stroke's change that a picture has, by its coverage (h, w, 1)."""
-        asked = (cover * np.abs(tonemap(self.target) - tonemap(self.base))).sum(dtype=np.float64)
-        left = (cover * np.abs(tonemap(self.target) - tonemap(picture))).sum(dtype=np.float64)
-        return float(np.clip(1 - left / asked, 0, 1)) if asked > 0 else 1.0
 
 
 @dataclass(frozen=True)
@@ -84,7 +56,7 @@ class Action:
 
 def said(
     document: Document,
-    painted: Painted,
+    request: Request,
     rendering: np.ndarray,
     reach: Reach,
     strokes: Sequence[np.ndarray],
@@ -96,7 +68,7 @@ def said(
     ----------
     document : Document
         What was painted, and how it is solved for.
-    painted, rendering
+    request, rendering
         What was asked for, and what was reached of it, (h, w, 3).
     reach : Reach
         What is feasible.
@@ -106,25 +78,25 @@ def said(
         What lights the pixels.
     """
     shares = {
-        i: painted.of_stroke(rendering, cover)
+        i: request.of_stroke(rendering, cover)
         for i, cover in enumerate(strokes)
         if document.strokes[i]["type"] != "hold"
     }
     missed = sorted((i for i in shares if shares[i] < WARNED_SHARE), key=lambda i: shares[i])
-    if painted.reached(rendering) >= WARNED_SHARE or not missed:
+    if request.reached(rendering) >= WARNED_SHARE or not missed:
         return "", []
     worst = missed[0]
-    left = np.float64(tonemap(painted.target)) - tonemap(rendering)
+    left = np.float64(tonemap(request.target)) - tonemap(rendering)
     dark = float((strokes[worst] * left).sum()) > 0
     stays = "too dark" if dark else "too bright"
     text = f"stroke {worst + 1} ({document.strokes[worst]['type']}) stays {stays}"
-    why, actions = _why(document, painted, reach, strokes[worst], light, worst, dark)
+    why, actions = _why(document, request, reach, strokes[worst], light, worst, dark)
     others = [f"{i + 1} ({_percent(shares[i])})" for i in missed[1:MOST_NAMED]]
     also = f"; little is reached of {', '.join(others)} too" if others else ""
     return f"{text}: {why}{also}", actions
 
 
-def _why(document, painted, reach, cover, light, i, dark):
+def _why(document, request, reach, cover, light, i, dark):
     """Return a phrase on why a stroke is missed, and what can be done about it in the document."""
     change = "brighter" if dark else "darker"
     follow = Action("Let the rest follow", {"rest": "follow"})
@@ -137,12 +109,12 @@ def _why(document, painted, reach, cover, light, i, dark):
     # ---- Where the map cannot make it so
     if dark and mean(light.white) < UNLIT_SHARE * light.white.mean():
         return "hardly any light of the map reaches it", []
-    if not dark and mean(light.lamps) > 0.5 * mean(painted.base):
+    if not dark and mean(light.lamps) > 0.5 * mean(request.base):
         return "most of its light is of lamps of the scene, which no map changes", []
     # ---- Where the settings keep it from being so
     if document.rest == "keep":
         return "the rest, which stays, keeps it so", [follow]
-    feasible = painted.of_stroke(reach.picture, cover)
+    feasible = request.of_stroke(reach.picture, cover)
     if feasible >= WARNED_SHARE:
         if document.freedom < WARNED_SHARE:
             return f"a sky that may change so little does not make it {change}", [free]
@@ -168,7 +140,7 @@ def lights(
     problem: Problem,
     start: dict,
     state: dict,
-    painted: Painted,
+    request: Request,
     listed: list[picking.Placed],
     document: Document,
 ) -> list[Action]:
@@ -180,7 +152,7 @@ def lights(
         Of the paint, where the rest follows: it does where a light is placed by hand.
     start, state : dict
         The map as it is, and the solution.
-    painted : Painted
+    request : Request
         What was asked for.
     listed : list of Placed
         The document's lights.
@@ -197,14 +169,14 @@ def lights(
         return []
     held = [stroke for stroke in document.strokes if stroke["type"] == "hold"]
     found = []
-    for share, label, entries in _placed(problem, start, state, painted, listed, document):
-        if share > painted.reached(now):
+    for share, label, entries in _placed(problem, start, state, request, listed, document):
+        if share > request.reached(now):
             change = {"lights": entries, "strokes": held}
             found.append((share, Action(f"{label} there: {_percent(share)}", change)))
     return [action for _, action in sorted(found, key=lambda one: -one[0])]
 
 
-def _placed(problem, start, state, painted, listed, document):
+def _placed(problem, start, state, request, listed, document):
     """Yield what a light in its best place reaches, what is done, and the document's lights with it."""
     layers = problem.layers.lights
     own = [k for k in problem.shining(start) if k < layers.own]
@@ -214,21 +186,21 @@ def _placed(problem, start, state, painted, listed, document):
     if i is not None:
         dark = with_light(start, strongest, flux=DARK)
         away = problem.direction(state, strongest)
-        share, there = _best(problem, dark, start, strongest, painted, away)
+        share, there = _best(problem, dark, start, strongest, request, away)
         if there is not None:
             flux = [float(np.exp(there.log_flux[0])) * value for value in listed[i].entry["flux"]]
             moved = {"flux": flux} | picking.place(there.direction, document)
             yield share, f"Drag light {i + 1}", picking.changed(listed, i, moved, document)
     # ---- One more
     spare = layers.own
-    share, there = _best(problem, start, start, spare, painted)
+    share, there = _best(problem, start, start, spare, request)
     if there is not None:
         flux = (np.exp(there.log_flux) * layers.flux[spare]).tolist()
         added = {"flux": flux, "size": there.degrees} | picking.place(there.direction, document)
         yield share, "Add a light", [*document.lights, added]
 
 
-def _best(problem, without, start, k, painted, away=None):
+def _best(problem, without, start, k, request, away=None):
     """Return what a light reaches at most, and its place; None where it reaches nothing.
 
     ``without`` is a state where it is dark, ``start`` the map's, ``away`` where it is not to be.
@@ -240,7 +212,7 @@ def _best(problem, without, start, k, painted, away=None):
         size = start["size"][k] if k < lights.own else lights.log_size(there.degrees)
         placed = with_light(start, k, turn=turn, flux=there.log_flux, size=size)
         rendering = problem.evaluate(placed).rendering
-        share = 0.0 if rendering is None else painted.reached(rendering)
+        share = 0.0 if rendering is None else request.reached(rendering)
         if share > most[0]:
             most = share, there
     return most

@@ -1,13 +1,12 @@
-"""One painting: the scene, its transport, and the map that follows what is painted.
+"""One painting: the scene, its transport, the map that follows what is painted, and what pages are shown.
 
 Everything here runs on the thread that owns Dr.Jit. What an edit asks for at once is done by
 :meth:`Session.update`; what takes longer, in pieces by :meth:`Session.advance`, until it returns False or a
 new edit comes.
 
-While strokes change, the present solution goes on: Gauss-Newton steps from where it is, towards the new
-target. The target is painted on T E_0, of a large picture at the size at which edits are solved. The edit
-that is saved is the pipeline's, which paints on Mitsuba's rendering, goes on from the solution here, and
-judges its result.
+The solution (``solution.py``) is towards paint on T E_0, of a large picture at the size at which edits are
+solved. The edit that is saved is the pipeline's, which paints on Mitsuba's rendering, goes on from the
+solution here, and judges its result.
 """
 
 from __future__ import annotations
@@ -30,6 +29,7 @@ from envedit import inputs, pipeline, renderers
 from envedit.cli.paint import advice, picking
 from envedit.cli.paint.project import MATCHED, SOLUTION, Project
 from envedit.cli.paint.protocol import ORIENTATION, Document, Edit, Pick
+from envedit.cli.paint.solution import COLUMNS, Solution
 from envedit.core import latlong
 from envedit.core.arrays import tensor
 from envedit.core.color import brightest_shown, tonemap
@@ -41,21 +41,16 @@ from envedit.images import images, map_regions
 from envedit.losses import display_curve
 from envedit.losses.perceptual import installed
 from envedit.report import output_folder, run_folder
-from envedit.representations.layers import below_horizon
-from envedit.representations.layers.layers import Layers
 from envedit.representations.layers.lights import DARK
-from envedit.representations.layers.oriented import oriented, oriented_share
+from envedit.representations.layers.oriented import oriented
 from envedit.representations.layers.placed_lights import PlacedLights, angles
-from envedit.representations.layers.unseen import unseen_kept
 from envedit.scene.scene import Scene
-from envedit.solve import checkpoint, feasibility, gauss_newton, hold, map_problem, prior, search
-from envedit.solve.likelihood import SIGMA, Likelihood
+from envedit.solve import checkpoint, feasibility, gauss_newton, search
 from envedit.solve.unknowns import with_light
-from envedit.targets import strokes, working_size
-from envedit.targets.pixel_weights import first_hold, pixel_weight
+from envedit.targets import working_size
 
-DRAGGED_COLUMNS, COLUMNS = 16, 32
-"""Most exact columns of T in one frame while a light is dragged, with the fewest paths, and otherwise."""
+DRAGGED_COLUMNS = 16
+"""Most exact columns of T in one frame while a light is dragged, with the fewest paths."""
 QUICK_SPP = 32
 """Paths a pixel of the transport that estimates what a dragged light changes: an eighth of the texels'
 weights to read in every frame, and its errors cancel where nothing changes."""
@@ -109,11 +104,9 @@ class Session:
 
     def __init__(self, project: Project, tell: Tell, newer: Callable[[], bool] = lambda: False):
         self.project, self.tell = project, tell
-        self._saving = self.solving = False
+        self._saving = self._dragged = False
         self.newer = lambda: not self._saving and newer()
         self.reach: feasibility.Reach | None = None  # of what is painted, once it is known
-        self.explanations: list[search.Explanation] = []  # of the paint; one of them is shown
-        self.explanation = 0
         self._kept = project.document  # as painted.toml has it
         self._memory_due = 0.0  # when freed buffers are given back while work goes on
         self.document, self.resting, self.phase = Document(), False, "done"
@@ -156,6 +149,7 @@ class Session:
         self._recorded = self._quick is self.transport
         self.transport.resolve(self.map, limit=COLUMNS)
         self.before = self.transport.apply(tensor(self.map)).numpy()
+        self.solution = Solution(settings, self.scene, self.placed, self.transport, self.rows)
         self._aim(self._usable(project.document))
         if project.start and self.solving:
             self._go_on_from(project.start)
@@ -220,134 +214,49 @@ class Session:
         """Say what is painted, to all pages but the one that has painted it."""
         self.tell.say({"type": "document", "client": client, "document": self.document.plain()})
 
+    @property
+    def solving(self) -> bool:
+        """Whether there is paint to be followed."""
+        return not self._dragged and self.solution.solving
+
     def _aim(self, document):
         """Take lights and orientation of a document for the map that is painted on."""
         self.document, self._dragged = document, False
-        changed = self.placed.by_hand(document.lights, document.regions)
-        self.origin = oriented(changed.envmap, document.orientation)
-        locked = None if changed.locked is None else oriented(changed.locked, document.orientation)
-        self.kept = None if changed.kept is None else oriented_share(changed.kept, document.orientation)
-        given = self.project.settings.input
-        horizon = below_horizon.treatment(given.horizon, given.rows, self.origin)
-        layers = Layers.of(
-            self.origin[self.rows.slice],
-            self.rows.place,
-            horizon=horizon,
-            fixed=None if locked is None else locked[self.rows.slice],
-            kept=None if self.kept is None else self.kept[self.rows.slice],
-        )
-        self.transport.resolve(self.origin, limit=COLUMNS)
-        self.base = self.transport.apply(tensor(self.origin)).numpy()
-        self.problem = map_problem.Problem(layers, self.transport, self.origin, self.base)
-        self.still = self.start = self.problem.state(layers.start())
-        self.run = gauss_newton.Run(self.start, self.start)
-        self.point = self.problem.evaluate(self.run.state, resolve=False)
-        self._painted: tuple[list, strokes.Painted] | None = None
-        self._rendered = None
-        self._paint()
+        self._paint(self.solution.aim)
         self._tell_lights()
+
+    def _paint(self, how=None):
+        """Paint the document's strokes, as :meth:`.Solution.paint` does or :meth:`.Solution.aim`."""
+        explained = bool(self.solution.explanations)
+        (how or self.solution.paint)(self.document)
+        self.reach, self.advised, self._rendered = None, False, None
+        if explained:
+            self._tell_explanations()
 
     def _drag(self):
         """Show the map with its lights placed, and what paint has added to it before."""
         if not self._dragged:
-            self._quick.resolve(self.point.edited, limit=COLUMNS)
-            self._still_quick = self._quick.apply(tensor(self.point.edited)).numpy()
-        self._dragged, self.solving = True, False
+            self._quick.resolve(self.solution.point.edited, limit=COLUMNS)
+            self._still_quick = self._quick.apply(tensor(self.solution.point.edited)).numpy()
+        self._dragged = True
         document = self.document
         placed = map_regions.changed(self.placed.place(document.lights), document.regions)
         # To look for its lights takes longer than a frame.
         origin = oriented(placed, document.orientation, lights=[])
-        found = np.maximum(origin + (self.point.edited - self.origin), 0).astype(np.float32)
+        added = self.solution.point.edited - self.solution.origin
+        found = np.maximum(origin + added, 0).astype(np.float32)
         self._quick.probe(self._quick.bright_texels(found)[: min(DRAGGED_COLUMNS, self._quick.capacity)])
         changed = self._quick.apply(tensor(found)).numpy() - self._still_quick
-        self._preview = found, np.maximum(self.point.rendering + changed, 0)
-
-    @property
-    def _chosen(self):
-        """The configuration, with what the document says of the rest."""
-        settings = self.project.settings
-        return replace(settings, target=replace(settings.target, rest=self.document.rest))
-
-    def _paint(self):
-        """Paint the strokes and aim the solution at them."""
-        chosen, self.reach, self.searched, self.advised = self._chosen, None, False, False
-        if self.explanations:
-            self._explain([])
-        self.hold = first_hold(chosen)
-        painted = self._after(list(self.document.strokes), chosen.target.display_tonemap)
-        coverage = None if painted is None else np.where(self._hidden[..., None], 0, painted.coverage)
-        self.solving = bool(coverage is not None and coverage.any())
-        if not self.solving:
-            self.start = self.still
-            self.run = gauss_newton.Run(self.start, self.start)
-            self.point = self.problem.evaluate(self.start, resolve=False)
-            self.target, self.weight, self.coverage = self.base, None, None
-            return
-        self.target, self.coverage = painted.picture, coverage
-        self._weigh()
+        self._preview = found, np.maximum(self.solution.point.rendering + changed, 0)
 
     def _go_on_from(self, file):
         """Take the solution that was saved of this document."""
         try:
-            self.run = checkpoint.load_solution(Path(file), self.still)
+            run = checkpoint.load_solution(Path(file), self.solution.still)
         except InputError as error:
             self.notes = [*self.notes, str(error)]
-            return
-        self.start, self.searched = self.run.start, True
-        if self.run.hold > 1:
-            self.hold = self.run.hold
-        self.point = self.problem.evaluate(self.run.state)
-        self._weigh()
-
-    def _weigh(self):
-        """Aim the solution at the paint, with the present weight of what was not painted."""
-        self.weight, likelihood = self._likelihood(self.hold)
-        self.problem.expect(prior.of_paint(self.document.freedom, self.coverage))
-        self.point = self.problem.aimed_at(self.target, likelihood, self.point)
-        self.run, self._rendered = gauss_newton.Run(self.run.state, self.start), None
-
-    def _likelihood(self, hold):
-        """Return the weight of pixels where those without paint have one, and the likelihood of the paint."""
-        weight = pixel_weight(self.coverage, self._hidden, self.project.settings.target.paint, hold)
-        return weight, Likelihood.of_paint(weight, self.coverage, self.base, self.target)
-
-    def _held_more(self):
-        """Give more weight to what was not painted, if it has changed visibly, as an edit does."""
-        chosen = self._chosen.target
-        seen = self.point.rendering, self.target, self.coverage, self.weight
-        more = hold.further(chosen, self.hold, *seen)
-        if more is None:
-            return False
-        self.hold = self.status["hold"] = more
-        self._weigh()
-        return True
-
-    @property
-    def _hidden(self):
-        """Pixels that see no surface, where the scene hides what lights it: they do not count."""
-        shape = self.scene.height, self.scene.width
-        return np.zeros(shape, bool) if self.scene.alpha is None else self.scene.alpha == 0
-
-    def _after(self, painted, tonemap):
-        """Paint strokes; all but the last as they were painted before, where they are the same."""
-        if not painted:
-            return None
-        first = painted[:-1]
-        if self._painted is None or self._painted[0] != first:
-            bare = strokes.Painted(self.base, np.zeros((*self.base.shape[:2], 1), np.float32))
-            self._painted = first, self._on_views(bare, first, tonemap)
-        return self._on_views(self._painted[1], painted[-1:], tonemap)
-
-    def _on_views(self, before, painted, tonemap):
-        """Paint strokes, each on its view, over what was painted before."""
-        picture, coverage = before.picture.copy(), before.coverage.copy()
-        views = [self.scene.view(one.get("view", 0), "target.strokes.view") for one in painted]
-        for view in sorted(set(views)):
-            rows = self.scene.rows[view]
-            own = [one for one, on in zip(painted, views, strict=True) if on == view]
-            made = strokes.paint(picture[rows], own, tonemap)
-            picture[rows], coverage[rows] = made.picture, 1 - (1 - coverage[rows]) * (1 - made.coverage)
-        return strokes.Painted(picture, coverage)
+        else:
+            self.solution.go_on_from(run)
 
     # ---- what goes on --------------------------------------------------------------------------------------
 
@@ -374,7 +283,7 @@ class Session:
                 return True
             if not self._recorded:  # paths, before the first light is dragged: that takes seconds
                 self._recorded = True
-                self._quick.resolve(self.point.edited, limit=COLUMNS)
+                self._quick.resolve(self.solution.point.edited, limit=COLUMNS)
                 return True
             if self.solving and self.reach is None:
                 self._reach()
@@ -393,13 +302,14 @@ class Session:
         """
         if not self.solving:
             return False
-        enough = self.converged or len(self.run.history) >= search.EXPLANATION_STEPS
-        if settled and enough and not self.searched:
+        solution = self.solution
+        enough = solution.converged or len(solution.run.history) >= search.EXPLANATION_STEPS
+        if settled and enough and not solution.searched:
             self._search()
-        elif not self.converged:
+        elif not solution.converged:
             self._step()
         else:
-            return settled and self._held_more()
+            return settled and self._hold_more()
         return True
 
     @property
@@ -416,15 +326,16 @@ class Session:
     @property
     def converged(self) -> bool:
         """Whether no further step is made towards what is painted."""
-        return not self.solving or self.run.finished or len(self.run.history) >= gauss_newton.MOST_STEPS
+        return not self.solving or self.solution.converged
 
     def _step(self):
         began = time.perf_counter()
-        self.point = gauss_newton.descended(self.problem, self.run, self.point)
-        self.status["iterations"] = len(self.run.history)
+        self.solution.step()
+        history = self.solution.run.history
+        self.status["iterations"] = len(history)
         self.status["steps"] += 1
-        if self.run.history:
-            self.status["residual"] = self.run.history[-1]["residual"]
+        if history:
+            self.status["residual"] = history[-1]["residual"]
         self.status["ms"] = round(1000 * (time.perf_counter() - began), 1)
         self._show("transport")
         self.tell_state()
@@ -432,29 +343,29 @@ class Session:
             self._tell_lights()
 
     def _search(self):
-        """Ask whether another start leads further, as the pipeline does; a newer edit ends it.
-
-        A light that jumps, or that is added, is where no small step leads.
-        """
+        """Ask whether another start leads further; a newer edit ends it."""
         self._tell_doing("looking for other lights")
-        now = search.score(self.problem, self.run, self.point, SIGMA)
-        found = search.search(self.problem, self.still, after_step=self._unless_newer)
-        self.searched = True
-        if found.score < now:
-            self.run, self.start = found.run, found.run.start
+        before = self.solution.run
+        self.solution.search(self._unless_newer)
+        if self.solution.run is not before:
             self._rendered = None
-        self.point = self.problem.evaluate(self.run.state)  # others may have taken its columns
-        self._explain([replace(found, run=self.run, point=self.point), *found.others] if found.others else [])
+        self._tell_explanations()
         self._show("transport")
         self._tell_lights()
         self.tell_state()
 
-    def _explain(self, explanations, chosen=0):
-        """Take explanations of the paint, of which one is shown, and show them in the pages."""
-        self.explanations, self.explanation = explanations, chosen
-        listed = [
-            {"name": one.name, "reached": self._asked.reached(one.point.rendering)} for one in explanations
-        ]
+    def _hold_more(self):
+        """Give more weight to what was not painted, if that is due."""
+        if not self.solution.hold_more():
+            return False
+        self.status["hold"], self._rendered = self.solution.hold, None
+        return True
+
+    def _tell_explanations(self):
+        """Show the explanations of the paint in the pages."""
+        explanations, chosen = self.solution.explanations, self.solution.chosen
+        reached = self.solution.request.reached if explanations else None
+        listed = [{"name": one.name, "reached": reached(one.point.rendering)} for one in explanations]
         self.tell.say({"type": "explanations", "chosen": chosen, "explanations": listed})
         if explanations:
             renderings = np.concatenate([one.point.rendering for one in explanations])
@@ -464,16 +375,12 @@ class Session:
 
     def choose(self, index: int) -> None:
         """Go on from another explanation of the paint; that which is shown stays among them."""
-        if self._dragged or not 0 <= index < len(self.explanations):
+        if self._dragged or not 0 <= index < len(self.solution.explanations):
             return  # of what was painted before
-        explanations = list(self.explanations)
-        shown = explanations[self.explanation]
-        explanations[self.explanation] = replace(shown, run=self.run, point=self.point)
-        self.run = gauss_newton.Run(explanations[index].run.state, explanations[index].run.start)
-        self.start, self.point = self.run.start, self.problem.evaluate(self.run.state)
+        self.solution.choose(index)
         self._rendered, self.resting, self.advised = None, False, False
         self.status = {"iterations": 0, **{name: self.status[name] for name in ("steps", "number", "client")}}
-        self._explain(explanations, index)
+        self._tell_explanations()
         self._show("transport")
         self._tell_lights()
         self.tell_state()
@@ -513,48 +420,41 @@ class Session:
     def _reach(self):
         """Ask how much of what is painted any light could do; a newer edit ends it."""
         self._tell_doing("estimating how much of the target is feasible")
+        solution = self.solution
         self.reach = feasibility.reachable(
             self._watched,
-            self.problem.envmap,
-            self.target,
-            self.problem.likelihood,
+            solution.origin,
+            solution.target,
+            solution.problem.likelihood,
             self.rows,
-            painted=self.coverage[..., 0],
-            rendered=self.base,
-            known=self.point.edited,
-            kept=self.kept,
+            painted=solution.coverage[..., 0],
+            rendered=solution.base,
+            known=solution.point.edited,
+            kept=solution.kept,
         )
         self._tell_unreachable()
         self.tell_state()
 
     def _advise(self):
         """Say what reaches more, where little is reached; a newer edit ends it."""
-        painted, document, self.advised = self._asked, self.document, True
-        bare = strokes.Painted(self.base, np.zeros_like(self.coverage))
-        tonemap = self._chosen.target.display_tonemap
-        alone = [self._on_views(bare, [one], tonemap).coverage for one in document.strokes]
+        solution, document, self.advised = self.solution, self.document, True
+        request = solution.request
         white = self.transport.linear(tensor(np.ones_like(self.map))).numpy()
         lamps = self.transport.apply(tensor(np.zeros_like(self.map))).numpy()
         light = advice.Light(white, lamps)
-        text, actions = advice.said(document, painted, self.point.rendering, self.reach, alone, light)
+        rendering, alone = solution.point.rendering, solution.coverages()
+        text, actions = advice.said(document, request, rendering, self.reach, alone, light)
         if text:
             self.advised = False
             self._tell_doing("looking for a better place of the light")
             self._unless_newer()
-            held, listed = self.problem.likelihood, picking.lights(self.placed, document)
-            _, likelihood = self._likelihood(first_hold(self._chosen))
-            self.problem.aimed_at(self.target, likelihood, self.point)
-            actions += advice.lights(self.problem, self.still, self.run.state, painted, listed, document)
-            there = self.problem.evaluate(self.run.state)  # that has taken its columns
-            self.point = self.problem.aimed_at(self.target, held, there)
+            with solution.as_held_first() as problem:
+                listed = picking.lights(self.placed, document)
+                state = solution.run.state
+                actions += advice.lights(problem, solution.still, state, request, listed, document)
             self.advised = True
             self.status["advice"] = {"text": text, "actions": [asdict(action) for action in actions]}
         self.tell_state()
-
-    @property
-    def _asked(self):
-        """What was painted, and on what."""
-        return advice.Painted(self.base, self.target, self.coverage)
 
     def _tell_unreachable(self):
         """Show what of the paint is not feasible, once that is known."""
@@ -565,7 +465,7 @@ class Session:
 
     def _edited(self):
         """Return the map as it is edited (H, W, 3), before exposure and colours."""
-        return self._preview[0] if self._dragged else unseen_kept(self.origin, self.point.edited)
+        return self._preview[0] if self._dragged else self.solution.edited
 
     def _adjusted(self, edited):
         """Return a map as it is shown: with exposure and temperature; the map itself without."""
@@ -576,7 +476,7 @@ class Session:
     def _show(self, source):
         edited = self._edited()
         shown = self._adjusted(edited)
-        rendering = self._preview[1] if self._dragged else self.point.rendering
+        rendering = self._preview[1] if self._dragged else self.solution.point.rendering
         if shown is not edited:
             by = self._quick if self._dragged else self.transport
             rendering = by.apply(tensor(shown)).numpy()
@@ -585,9 +485,10 @@ class Session:
             self.tell.frame("render", source, rendering, self.scene.rows)
             self.tell.frame("map", source, shown)
         if not self._dragged:
-            both, white = (self.target, self.point.rendering), self.problem.likelihood.white
-            target, solution = (display_curve.to_display(tensor(one), white).numpy() for one in both)
-            self.tell.frame("difference", source, target - solution, self.scene.rows)
+            solution = self.solution
+            both, white = (solution.target, solution.point.rendering), solution.problem.likelihood.white
+            target, reached = (display_curve.to_display(tensor(one), white).numpy() for one in both)
+            self.tell.frame("difference", source, target - reached, self.scene.rows)
 
     def sky(self) -> None:
         """Show the map large, as it is edited and as it was given, at the resolution of its file."""
@@ -600,9 +501,10 @@ class Session:
         rotated = {name: getattr(document, name) for name in ORIENTATION}
         by_hand = replace(settings, lights=document.lights, regions=document.regions, **rotated)
         given = replace(self.given, placed=self.placed if document.lights or document.regions else None)
-        params = self.problem.solution_params(self.run.state)
-        edit = file_resolution.Found(self.problem.layers, params, None, 0.0, self.point.edited)
-        _, carried = file_resolution.carried(by_hand, given, self._wide, edit, self.origin)
+        solution = self.solution
+        params = solution.problem.solution_params(solution.run.state)
+        edit = file_resolution.Found(solution.problem.layers, params, None, 0.0, solution.point.edited)
+        _, carried = file_resolution.carried(by_hand, given, self._wide, edit, solution.origin)
         self.tell.frame("sky-before", "transport", self._wide.radiance)
         self.tell.frame("sky", "transport", self._adjusted(carried))
         self.tell_state()
@@ -614,7 +516,7 @@ class Session:
         if self.photograph is not None:
             self.tell.frame("photograph", "transport", self.photograph)
         self._tell_unreachable()
-        self._explain(self.explanations, self.explanation)
+        self._tell_explanations()
         self._show("transport")
         self._rendered = None
         self._tell_lights()
@@ -638,10 +540,11 @@ class Session:
                     "radius": radius,
                 }
             )
-        found, layers = [], self.problem.layers
-        for i in self.problem.shining(self.run.state):
-            azimuth, elevation = angles(self.problem.direction(self.run.state, i))
-            flux = layers.lights.flux[i] * np.exp(self.run.state["flux"][i])
+        found = []
+        problem, state = self.solution.problem, self.solution.run.state
+        for i in problem.shining(state):
+            azimuth, elevation = angles(problem.direction(state, i))
+            flux = problem.layers.lights.flux[i] * np.exp(state["flux"][i])
             found.append({"azimuth": azimuth, "elevation": elevation, "flux": flux.tolist()})
         self.tell.say({"type": "lights", "own": own, "found": found})
 
@@ -649,7 +552,7 @@ class Session:
         """Say what goes on, and how good the solution is: what is reached of the paint, and feasible."""
         reached = reachable = None
         if self.solving:
-            reached = self._asked.reached(self.point.rendering)
+            reached = self.solution.request.reached(self.solution.point.rendering)
             reachable = None if self.reach is None else max(self.reach.share, reached)
         rendered = self._rendered[0] * PASS if self._rendered else 0
         share = {"reached": reached, "reachable": reachable}
@@ -668,15 +571,16 @@ class Session:
         """Say whose highlight or shadow a pixel shows, or where its light must go (:mod:`.picking`)."""
         answer = {"type": "picked", "number": asked.number, "client": asked.client}
         shown = picking.lights(self.placed, self.document)
-        centres, solved = self.problem.layers.lights.centres, self.run.state
-        own = {k: picking.index_of(shown, centres[k]) for k in self.problem.shining(self.still)}
+        problem, solved = self.solution.problem, self.solution.run.state
+        centres = problem.layers.lights.centres
+        own = {k: picking.index_of(shown, centres[k]) for k in problem.shining(self.solution.still)}
         if asked.of == "shares":
-            added = {k: None for k in self.problem.added(solved)}
+            added = {k: None for k in problem.added(solved)}
             self.tell.say(answer | self._shares(asked, own | added))
             return
         for k, i in {} if self._dragged else own.items():
             if i is not None:  # where paint has put it
-                shown[i] = replace(shown[i], direction=self.problem.direction(solved, k))
+                shown[i] = replace(shown[i], direction=problem.direction(solved, k))
         self.tell.say(answer | self.picking.answer(asked, self.document, shown))
 
     def _shares(self, asked, index):
@@ -685,12 +589,12 @@ class Session:
         ``index`` has that of the layers' lights; -1 is for those that paint has added.
         """
         seen = self.picking.seen(min(asked.view, len(self.scene.rows) - 1), asked.x, asked.y)
-        whole = float((seen * self.point.edited.mean(axis=2)).sum())
-        rows = self.rows.slice
+        solution, rows = self.solution, self.rows.slice
+        whole = float((seen * solution.point.edited.mean(axis=2)).sum())
         shares: dict[int, float] = {}
         for k, i in index.items() if whole > 0 else ():
-            dark = self.problem.params(with_light(self.run.state, k, flux=DARK))
-            lost = (self.point.edited[rows] - self.problem.layers.decode(dark).numpy()).mean(axis=2)
+            dark = solution.problem.params(with_light(solution.run.state, k, flux=DARK))
+            lost = (solution.point.edited[rows] - solution.problem.layers.decode(dark).numpy()).mean(axis=2)
             i = -1 if i is None else i
             shares[i] = shares.get(i, 0.0) + float((seen[rows] * lost).sum()) / whole
         return {"light": max(shares, key=lambda i: shares[i], default=-1), "shares": list(shares.items())}
@@ -721,8 +625,9 @@ class Session:
         project.keep(self.document, start)
         self._kept = self.document
         if start:
-            solution = gauss_newton.Run(self.run.state, self.run.start, hold=self.hold)
-            checkpoint.save_solution(folder / SOLUTION, solution)
+            run = self.solution.run
+            solved = gauss_newton.Run(run.state, run.start, hold=self.solution.hold)
+            checkpoint.save_solution(folder / SOLUTION, solved)
 
         # ---- The run that goes on from it
         settings = installed.settled(project.configured(self.document, start))
@@ -771,7 +676,7 @@ class Session:
         """Say by how much the rendering of the map that was saved differs from the one that was shown."""
         self.transport.resolve(np.maximum(shown, saved))  # the columns of one are not to displace the other's
         before, after = (tonemap(self.transport.apply(tensor(one)).numpy()) for one in (shown, saved))
-        self.point = self.problem.evaluate(self.run.state)  # that has taken its columns
+        self.solution.refresh()
         change = np.abs(after - before)
         return (
             f"the picture differs from the one shown before by {change.mean():.2g} of a display value on "

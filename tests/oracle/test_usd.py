@@ -94,6 +94,29 @@ def add_dome(stage, radiance=1.0, path="/dome", file="", kind=UsdLux.DomeLight):
     return dome
 
 
+def add_texture(stage, material, file, reads="st"):
+    """A texture of a material's, and what reads its place from a primvar."""
+    texture = UsdShade.Shader.Define(stage, f"{material}/texture")
+    texture.CreateIdAttr("UsdUVTexture")
+    texture.CreateInput("file", Sdf.ValueTypeNames.Asset).Set(file)
+    reader = UsdShade.Shader.Define(stage, f"{material}/reader")
+    reader.CreateIdAttr("UsdPrimvarReader_float2")
+    reader.CreateInput("varname", Sdf.ValueTypeNames.String).Set(reads)
+    return texture, reader
+
+
+def connect(shader, key, source, output, kind=Sdf.ValueTypeNames.Float2):
+    shader.CreateInput(key, kind).ConnectToSource(source.ConnectableAPI(), output)
+
+
+def lit_stage(folder):
+    """A stage with a camera and a white dome."""
+    stage = new_stage(folder)
+    add_camera(stage)
+    add_dome(stage)
+    return stage
+
+
 def saved(stage):
     stage.Save()
     return stage.GetRootLayer().realPath
@@ -291,9 +314,7 @@ def test_instances_stand_where_copies_would(tmp_path):
     for kind in ("copies", "instanceable", "points"):
         folder = tmp_path / kind
         folder.mkdir()
-        stage = new_stage(folder)
-        add_camera(stage)
-        add_dome(stage)
+        stage = lit_stage(folder)
         if kind == "copies":
             for k, move in enumerate(places):
                 place(add_square(stage, f"/s{k}", 0.4, (0.8, 0.4, 0.1)), move=move)
@@ -321,9 +342,7 @@ def test_instances_stand_where_copies_would(tmp_path):
 
 def test_subsets_have_their_materials_and_rows_of_textures_go_up(tmp_path):
     """The lower half of the square is red; the upper has a texture whose first row is white, others black."""
-    stage = new_stage(tmp_path)
-    add_camera(stage)
-    add_dome(stage)
+    stage = lit_stage(tmp_path)
     mesh = UsdGeom.Mesh.Define(stage, "/mesh")
     points = [(x, y, 0) for y in (-1, 0, 1) for x in (-1, 1)]
     mesh.GetPointsAttr().Set(Vt.Vec3fArray([Gf.Vec3f(*p) for p in points]))
@@ -337,15 +356,9 @@ def test_subsets_have_their_materials_and_rows_of_textures_go_up(tmp_path):
     pixels = np.zeros((2, 2, 3), np.uint8)
     pixels[0] = 255
     mi.Bitmap(pixels).write(str(tmp_path / "rows.png"))
-    texture = UsdShade.Shader.Define(stage, "/textured/texture")
-    texture.CreateIdAttr("UsdUVTexture")
-    texture.CreateInput("file", Sdf.ValueTypeNames.Asset).Set("rows.png")
-    reader = UsdShade.Shader.Define(stage, "/textured/reader")
-    reader.CreateIdAttr("UsdPrimvarReader_float2")
-    reader.CreateInput("varname", Sdf.ValueTypeNames.String).Set("map")
-    texture.CreateInput("st", Sdf.ValueTypeNames.Float2).ConnectToSource(reader.ConnectableAPI(), "result")
-    colour = shader.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f)
-    colour.ConnectToSource(texture.ConnectableAPI(), "rgb")
+    texture, reader = add_texture(stage, "/textured", "rows.png", reads="map")
+    connect(texture, "st", reader, "result")
+    connect(shader, "diffuseColor", texture, "rgb", Sdf.ValueTypeNames.Color3f)
     bind(mesh, textured)
     subset = UsdShade.MaterialBindingAPI(mesh).CreateMaterialBindSubset("lower", Vt.IntArray([0]))
     bind(subset, red)
@@ -356,9 +369,7 @@ def test_subsets_have_their_materials_and_rows_of_textures_go_up(tmp_path):
 
 
 def test_what_is_hidden_or_a_guide_is_left_out(tmp_path):
-    stage = new_stage(tmp_path)
-    add_camera(stage)
-    add_dome(stage)
+    stage = lit_stage(tmp_path)
     add_square(stage, "/shown")
     add_square(stage, "/hidden").MakeInvisible()
     UsdGeom.Imageable(add_square(stage, "/guide")).GetPurposeAttr().Set("guide")
@@ -380,31 +391,23 @@ def test_what_is_hidden_or_a_guide_is_left_out(tmp_path):
 
 def test_one_channel_of_a_texture_that_is_moved_scaled_and_turned(tmp_path):
     """Alpha is 0, 0.25, 0.5, 0.75 in four columns; a texture turned by 90 degrees runs along y instead."""
-    stage = new_stage(tmp_path)
-    add_camera(stage)
-    add_dome(stage)
+    stage = lit_stage(tmp_path)
     mesh = add_square(stage)
     add_uv(mesh)
     material, shader = add_material(stage, "/cut", diffuseColor=(0.0, 0.0, 0.0), ior=1.0)
     pixels = np.full((4, 4, 4), 255, np.uint8)
     pixels[..., 3] = [0, 64, 128, 192]
     mi.Bitmap(pixels).write(str(tmp_path / "a.png"))
-    texture = UsdShade.Shader.Define(stage, "/cut/texture")
-    texture.CreateIdAttr("UsdUVTexture")
-    texture.CreateInput("file", Sdf.ValueTypeNames.Asset).Set("a.png")
+    texture, reader = add_texture(stage, "/cut", "a.png")
     texture.CreateInput("wrapS", Sdf.ValueTypeNames.Token).Set("repeat")
     move = UsdShade.Shader.Define(stage, "/cut/move")
     move.CreateIdAttr("UsdTransform2d")
     move.CreateInput("rotation", Sdf.ValueTypeNames.Float).Set(-90.0)  # (u, v) -> (v, -u)
     move.CreateInput("scale", Sdf.ValueTypeNames.Float2).Set(Gf.Vec2f(1, 0.5))
     move.CreateInput("translation", Sdf.ValueTypeNames.Float2).Set(Gf.Vec2f(0.25, 1))
-    reader = UsdShade.Shader.Define(stage, "/cut/reader")
-    reader.CreateIdAttr("UsdPrimvarReader_float2")
-    reader.CreateInput("varname", Sdf.ValueTypeNames.String).Set("st")
-    move.CreateInput("in", Sdf.ValueTypeNames.Float2).ConnectToSource(reader.ConnectableAPI(), "result")
-    texture.CreateInput("st", Sdf.ValueTypeNames.Float2).ConnectToSource(move.ConnectableAPI(), "result")
-    opacity = shader.CreateInput("opacity", Sdf.ValueTypeNames.Float)
-    opacity.ConnectToSource(texture.ConnectableAPI(), "a")
+    connect(move, "in", reader, "result")
+    connect(texture, "st", move, "result")
+    connect(shader, "opacity", texture, "a", Sdf.ValueTypeNames.Float)
     bind(mesh, material)
     picture, _ = rendered(stage, 48, 256)
     for v in (0.125, 0.375):  # middles of texels: u = v / 2 + 0.25
@@ -416,9 +419,7 @@ def test_one_channel_of_a_texture_that_is_moved_scaled_and_turned(tmp_path):
 
 @pytest.mark.slow
 def test_glass_gold_and_a_cut_out(tmp_path):
-    stage = new_stage(tmp_path)
-    add_camera(stage)
-    add_dome(stage)
+    stage = lit_stage(tmp_path)
     gold, _ = add_material(stage, "/gold", diffuseColor=(1.0, 0.7, 0.3), metallic=1.0, roughness=0.2)
     half, _ = add_material(stage, "/half", diffuseColor=(0.0, 0.0, 0.0), opacity=0.25, ior=1.0)
     glass = UsdShade.Material.Define(stage, "/glass")
@@ -481,9 +482,7 @@ def multiplied(levels, options):
 
 
 def test_a_cloud_of_too_many_instances(tmp_path):
-    stage = new_stage(tmp_path)
-    add_camera(stage)
-    add_dome(stage)
+    stage = lit_stage(tmp_path)
     cloud = UsdGeom.PointInstancer.Define(stage, "/cloud")
     add_square(stage, "/cloud/square")
     cloud.CreatePrototypesRel().AddTarget("/cloud/square")

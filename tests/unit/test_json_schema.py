@@ -33,26 +33,8 @@ CHECKS |= {key: f.metadata["check"] for key, f in TOP.items() if key not in FIEL
 
 def edges(check):
     """Yield values at the ends of what a check accepts, and beyond."""
-    yield from (
-        None,
-        True,
-        "",
-        "auto",
-        "all",
-        "upper",
-        "none such",
-        -1,
-        0,
-        1,
-        2,
-        7,
-        0.5,
-        1e-3,
-        -0.25,
-        1e30,
-        [],
-        {},
-    )
+    yield from (None, True, "", "auto", "all", "upper", "none such", [], {})
+    yield from (-1, 0, 1, 2, 7, 0.5, 1e-3, -0.25, 1e30)
     yield from ([0], [0, 1], [1, 0], [3, 5.5], [0.5, 0.5], [-1, 2], [1, 2, 3], ["a"], ["a", "a"], [""], [[1]])
     yield from ({"a": 1}, {"a": "b", "c": True}, {"a": [1]}, 2000, 1999.5, 25000, 25001, "#ffd9a6", "#ffd9")
     while hasattr(check, "check"):

@@ -13,7 +13,6 @@ from envedit.solve.likelihood import (
     Likelihood,
     of_mean,
     on_average_one,
-    sizes,
 )
 from envedit.targets.pixel_weights import pixel_weight
 
@@ -180,7 +179,3 @@ def test_pixels_that_do_not_count_are_not_of_the_rest(rng):
     # Where the rest has no weight its mean is not held either.
     without = Likelihood.of_paint(pixel_weight(coverage, out, 1.0, 0.0), coverage, *pictures(coverage))
     assert not without.mean(residual).any()
-
-
-def test_size_of_a_residual_is_the_root_mean_square_of_its_channels():
-    assert sizes(np.array([[[3.0, 0, 0], [1, 1, 1]]])).ravel() == pytest.approx([np.sqrt(3), 1])

@@ -85,11 +85,14 @@ def test_other_shapes_types_and_values_are_refused(tmp_path):
     refused(archive, "'a.bias' holds nan at (0,)")
 
 
-def test_pytorch_files_are_not_unpickled(tmp_path):
-    class Trap:
-        def __reduce__(self):
-            return pytest.fail, ("a pickle was loaded",)
+class Trap:
+    """Unpickled as any object is, it calls a function."""
 
+    def __reduce__(self):
+        return pytest.fail, ("a pickle was loaded",)
+
+
+def test_pytorch_files_are_not_unpickled(tmp_path):
     path = tmp_path / "old.pth"
     path.write_bytes(pickle.dumps({"a": Trap()}))
     refused(path, "PyTorch", "np.savez", "torch.load('old.pth'")
@@ -190,13 +193,6 @@ def test_hostile_archives_are_refused(tmp_path):
 
 
 # ---- pickled checkpoints -----------------------------------------------------------------------------------
-
-
-class Trap:
-    """Unpickled as any object is, it calls a function."""
-
-    def __reduce__(self):
-        return pytest.fail, ("a pickle was loaded",)
 
 
 @dataclasses.dataclass

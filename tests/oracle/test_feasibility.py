@@ -250,17 +250,6 @@ def test_radiance_of_any_size(dense, envmap, scale):
     assert sane(feasibility.reachable(dense, envmap * np.float32(scale), target), envmap).share > 0.7
 
 
-def test_one_painted_pixel(dense, envmap):
-    target = render(dense, envmap)
-    target[0, 0] *= 1.3
-    painted = np.zeros(PIXELS)
-    painted[0, 0] = 1
-    found = sane(
-        feasibility.reachable(dense, envmap, target, weighed(painted[..., None]), painted=painted), envmap
-    )
-    assert found.share > 0.95
-
-
 def test_nothing_seen(dense, envmap):
     target = 0.5 * render(dense, envmap)
     blind = Dense(np.zeros_like(dense.matrix), lamps=0.2)

@@ -183,13 +183,6 @@ def test_rotation_vector_between_equal_directions_is_zero(d):
 # ---- values ----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("top", "left"), [(1, 5), (5, 10), (12, 46), (21, 0)])
-def test_unmoved_light_gives_the_core_back(top, left, rng):
-    light = patch(rng, top, left)
-    got, expected = core(Lights([light], (0, H), W)), image_of(light)
-    assert np.abs(got - expected).max() < 1e-6 * expected.max()
-
-
 @pytest.mark.parametrize("columns", [1, -1, 7, 24, 47])
 @pytest.mark.parametrize("top", [2, 11])
 def test_turn_by_whole_texels_is_a_roll(top, columns, rng):

@@ -1,6 +1,5 @@
 """Adam and the schedules against trajectories recorded from PyTorch, and against closed forms."""
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -8,6 +7,8 @@ import pytest
 from envedit.core.errors import InputError
 from envedit.losses.optimizer import Adam, cosine, cosine_warm_restarts, ramp
 from tests.oracles import ROOT
+from tests.oracles.kernels import own
+from tests.oracles.matrix_renderer import same
 
 # python experiments/references/make_adam_reference.py tests/data/adam_reference.npz      (PyTorch 2.13.0)
 REFERENCE = ROOT / "tests" / "data" / "adam_reference.npz"
@@ -18,15 +19,6 @@ NAMES = ("weight", "bias", "texels")
 def reference():
     with np.load(REFERENCE) as file:
         return dict(file)
-
-
-def own(array):
-    """Put an array into Dr.Jit's memory, as a gradient is."""
-    return dr.opaque(mi.TensorXf(np.asarray(array, np.float32)))
-
-
-def same(a, b):
-    return a.keys() == b.keys() and all(np.array_equal(a[key], b[key]) for key in a)
 
 
 # --------------------------------------------------------------------------------------------------------
@@ -59,31 +51,6 @@ def test_adam_in_double_precision_is_the_algorithm(rng):
     np.testing.assert_allclose(np.array(adam.params["p"]), p, rtol=1e-13)
 
 
-def test_adam_finds_a_minimum_through_its_leaves():
-    adam = Adam({"x": mi.Float([3.0, -2.0])}, lr=0.1)
-    for step in range(300):
-        leaves = adam.leaves()
-        dr.backward(dr.sum(dr.square(leaves["x"] - mi.Float([1.0, 0.5]))))
-        adam.step({"x": dr.grad(leaves["x"])}, lr=cosine(0.1, step, 300))
-    assert type(adam.params["x"]) is mi.Float and not dr.grad_enabled(adam.params["x"])
-    np.testing.assert_allclose(np.array(adam.params["x"]), [1.0, 0.5], atol=1e-4)
-
-
-def test_kernels_are_compiled_once():
-    shapes = {"a": (32, 8), "b": (32, 8), "c": (8,), "d": (8,)}
-    adam = Adam({name: dr.zeros(mi.TensorXf, shape) for name, shape in shapes.items()}, lr=0.01)
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
-        for step in range(8):
-            grads = {name: own(np.full(shape, step + 1.0)) for name, shape in shapes.items()}
-            dr.sync_thread()
-            dr.kernel_history_clear()
-            adam.step(grads, lr=0.01 / (step + 1))
-            kernels = dr.kernel_history((dr.KernelType.JIT,))
-            assert len(kernels) == 2  # one for each size of parameter
-            if step >= 3:
-                assert all(kernel["cache_hit"] for kernel in kernels)
-
-
 def test_the_given_array_is_left_alone(rng):
     start = rng.random((4, 4)).astype(np.float32)
     kept = start.copy()
@@ -93,24 +60,6 @@ def test_the_given_array_is_left_alone(rng):
     np.testing.assert_array_equal(start, kept)
     start[:] = 7
     np.testing.assert_array_equal(np.array(adam.params["p"]), start_moved)
-
-
-def test_a_checkpoint_continues_exactly(tmp_path, rng):
-    grads = [{"a": rng.normal(size=(3, 2)), "b": rng.normal(size=5)} for _ in range(10)]
-    start = {"a": own(rng.random((3, 2))), "b": mi.Float(rng.random(5).astype(np.float32))}
-
-    def run(adam, part):
-        for g in part:
-            adam.step({"a": own(g["a"]), "b": mi.Float(g["b"].astype(np.float32))})
-        return adam.state_dict()
-
-    whole = run(Adam(start, lr=0.01), grads)
-    np.savez(tmp_path / "checkpoint.npz", **run(Adam(start, lr=0.01), grads[:4]))
-    resumed = Adam({"a": own(np.zeros((3, 2))), "b": dr.zeros(mi.Float, 5)}, lr=0.01)
-    with np.load(tmp_path / "checkpoint.npz") as file:
-        resumed.load_state_dict(file)
-    assert same(run(resumed, grads[4:]), whole)
-    assert whole["step"] == 10
 
 
 def test_a_state_of_other_parameters_is_refused():

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from envedit.cli.progress import Progress
-from envedit.core import array_cache, atomic_files
+from envedit.core import atomic_files
 from envedit.core.errors import InputError
 from envedit.core.seeds import Seeds
 from envedit.images import images, layered_exr
@@ -346,12 +346,3 @@ def test_a_write_that_comes_short_leaves_no_file(name, tmp_path):
     with largest_file(len(data)):
         WRITERS[name](path)
     assert len(path.read_bytes()) == len(data)
-
-
-def test_an_entry_of_a_cache_that_comes_short_is_none(tmp_path):
-    cache, key = array_cache.DiskCache(tmp_path), {"of": "a test"}
-    with largest_file(1000):
-        cache.store(key, {"a": PICTURE})
-    assert cache.load(key) is None and not names(tmp_path)
-    cache.store(key, {"a": PICTURE})
-    np.testing.assert_array_equal(cache.load(key)["a"], PICTURE)

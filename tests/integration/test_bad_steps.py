@@ -18,7 +18,6 @@ from envedit.core.seeds import Seeds
 from envedit.export import adjustments, file_resolution
 from envedit.images import images
 from envedit.losses import losses, optimizer
-from envedit.report import manifest
 from envedit.scene import scene
 from envedit.solve import adam_loop
 from envedit.transport.light_transport import LightTransport
@@ -433,12 +432,6 @@ def test_a_full_map_that_is_not_finite_does_not_cost_the_result(tmp_path, rng, m
     assert "edited_full.exr is not written" in said and "row 3, column 4" in said
     assert "metrics.json" in names(out) and "edited_full.exr" not in names(out)
     assert json.loads((out / "metrics.json").read_text())["iterations"] == 4
-
-
-def test_no_file_of_results_takes_what_is_not_finite():
-    lost = []
-    assert manifest.plain({"a": [1.0, math.nan], "b": math.inf}, "", lost) == {"a": [1.0, None], "b": None}
-    assert lost == ["a[1]", "b"]
 
 
 def test_dists_is_evaluated_now_and_then_and_counts_as_often(rng):

@@ -13,7 +13,6 @@ from envedit import config, representations
 from envedit.losses import losses, optimizer
 from envedit.losses.ssim import Ssim
 from envedit.solve import adam_loop
-from tests.oracles.kernels import launched
 from tests.oracles.matrix_renderer import (
     WIDTH,
     arrays,
@@ -246,12 +245,6 @@ def test_nineteen_bad_steps_in_a_row_are_survived(rng):
 # ---- continuing, repeating, cost -------------------------------------------------------------------------
 
 
-def test_the_same_run_twice_gives_the_same_bits(rng):
-    runs = [adam_loop.optimise(*case(np.random.default_rng(3), iterations=15)[0]) for _ in range(2)]
-    assert same(arrays(runs[0][0]), arrays(runs[1][0]))
-    assert without_times(runs[0][1].history) == without_times(runs[1][1].history)
-
-
 @pytest.mark.parametrize("cut", [1, 4, 7, 10, 15])
 def test_a_run_that_is_cut_and_continued_gives_the_same_bits(cut, rng, every_step):
     """Also where the next step is a bad one, and the step before the cut has to be taken back."""
@@ -282,38 +275,3 @@ def test_a_run_that_is_cut_and_continued_gives_the_same_bits(cut, rng, every_ste
     assert json.dumps(without_times(state.history)) == json.dumps(without_times(whole.history))
     assert (state.bad_steps, state.slowdown) == (whole.bad_steps, whole.slowdown)
     assert whole.bad_steps == 2 and math.isclose(whole.slowdown, 0.5)  # halved twice, ten good steps
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["log-pixels", "siren"])
-def test_no_new_kernel_after_the_third_iteration(kind, rng):
-    network = config.Representation(kind=kind, hidden=9, depth=1)
-    fitted = config.Fit(epochs=1, awp_gamma=0.0)
-    representation = representations.make(config.Config(representation=network, fit=fitted))
-    weights = config.Loss(ssim=(0.1, 10.0), luminance=(1e-2, 1e-4), tv=0.1, image_l1=(1.0, 2.0))
-    (_, _, renderer, objective, original, first, _), _ = case(rng, iterations=9, weights=weights)
-    params = representation.encode(original[:3])
-
-    def run(iterations):
-        settings = config.Optimizer(iterations=iterations, lr=1e-3)
-        adam_loop.optimise(representation, params, renderer, objective, original, first, settings)
-
-    first_kernels = launched(lambda: run(3))
-    assert first_kernels and launched(lambda: run(9)) <= first_kernels
-
-
-@pytest.mark.slow
-def test_memory_does_not_grow_with_the_iterations(rng):
-    arguments, _ = case(rng, iterations=400)
-    peaks = []
-
-    def measure(state, adam):
-        if state.step % 100 == 0:
-            dr.sync_thread()
-            peaks.append(dr.detail.malloc_watermark(dr.JitBackend.LLVM))
-            dr.detail.malloc_clear_statistics()  # the next peak starts from what is in use now
-
-    adam_loop.optimise(*arguments, after_step=measure)
-    assert len(peaks) == 4
-    # One map of 6 x 8 texels kept per step would be 58 kB per hundred.
-    assert peaks[3] < peaks[1] + 20_000

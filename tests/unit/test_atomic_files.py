@@ -97,13 +97,6 @@ def test_a_folder_is_worked_in_by_one_at_a_time(tmp_path):
         assert list(folder.iterdir()) == []
 
 
-@pytest.mark.parametrize("name", ["file", "file/inside", "x" * 300])
-def test_a_folder_that_cannot_be_is_an_input_error(tmp_path, name):
-    (tmp_path / "file").write_text("not a folder")
-    with pytest.raises(InputError, match="--out"), output_folder.alone(tmp_path / name):
-        pass
-
-
 def test_an_input_in_a_folder_of_results_is_not_moved_away(tmp_path):
     start = tmp_path / "variants" / "1.npz"
     start.parent.mkdir()

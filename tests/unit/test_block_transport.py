@@ -54,15 +54,6 @@ def test_a_light_constant_in_every_cell_is_rendered_as_by_the_transport(shape, g
 
 
 @pytest.mark.parametrize("shape, grid", SIZES)
-def test_averages_over_blocks(shape, grid, rng):
-    result = block_transport.make(transport(rng, shape, grid)[0], shape, grid)
-    pixels, _ = sides(shape, grid)
-    picture = rng.random((*shape, 2))
-    expected = [picture[b].mean(axis=(0, 1)) for b in tiles(*shape, pixels)]
-    np.testing.assert_allclose(result.to_blocks(picture), expected, rtol=1e-12)
-
-
-@pytest.mark.parametrize("shape, grid", SIZES)
 def test_cells_are_the_sphere(shape, grid, rng):
     result = block_transport.make(transport(rng, shape, grid)[0], shape, grid)
     assert result.omega.sum() == pytest.approx(4 * np.pi, rel=1e-12)

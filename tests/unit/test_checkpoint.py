@@ -57,21 +57,6 @@ def test_no_checkpoint_is_none(tmp_path):
     assert checkpoint.load(tmp_path / "nowhere", "what") is None
 
 
-def test_a_failed_write_leaves_the_older_one(tmp_path, rng, monkeypatch):
-    _, optimiser, renderer = example(rng)
-    checkpoint.save(tmp_path, "what", State(10), optimiser, renderer, PICTURE)
-
-    def full(file, **arrays):
-        file.write(b"half of it")
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(np, "savez", full)
-    with pytest.raises(InputError, match=r"checkpoint\.npz: cannot be written \(No space left on device\)"):
-        checkpoint.save(tmp_path, "what", State(20), optimiser, renderer, PICTURE)
-    assert checkpoint.load(tmp_path, "what")[0].step == 10
-    assert [path.name for path in tmp_path.iterdir()] == [checkpoint.NAME]
-
-
 def test_a_checkpoint_of_another_run_is_refused(tmp_path, rng):
     checkpoint.save(tmp_path, "what", *example(rng), PICTURE)
     with pytest.raises(InputError, match=r"checkpoint\.npz.*another configuration.*without --resume") as info:

@@ -36,7 +36,3 @@ def test_tonemap_values():
         ConfigError, match="unknown tonemap 'filmic'; use one of gamma, srgb, log, reinhard, linear"
     ):
         color.tonemap(0.5, "filmic")
-
-
-def test_luminance_weights_are_those_of_images():
-    np.testing.assert_array_equal(color.luminance(np.eye(3)), color.LUMINANCE)

@@ -1,8 +1,6 @@
 """Loading maps and writing images: another reader, real maps, full disks, values that must not be written."""
 
 import os
-import resource
-import signal
 
 import mitsuba as mi
 import numpy as np
@@ -188,21 +186,6 @@ def test_unwritable(tmp_path):
         with pytest.raises(ValueError, match=r"\(H, W, 3\), got shape \(4, 8, 4\)"):
             writer(tmp_path / "a", np.zeros((4, 8, 4)))
     assert os.listdir(tmp_path) == ["taken"]
-
-
-@pytest.mark.parametrize("writer", [images.write_exr, images.write_png])
-def test_a_full_disk_keeps_the_old_file(tmp_path, rng, writer):
-    path = tmp_path / "a.exr"
-    path.write_bytes(b"old")
-    limit, handler = resource.getrlimit(resource.RLIMIT_FSIZE), signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (8192, limit[1]))
-    try:
-        with pytest.raises(InputError, match=r"a.exr: cannot be written \(File too large\)"):
-            writer(path, rng.random((64, 128, 3)))
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limit)
-        signal.signal(signal.SIGXFSZ, handler)
-    assert path.read_bytes() == b"old" and os.listdir(tmp_path) == ["a.exr"]
 
 
 def test_write_png(tmp_path):

@@ -83,6 +83,13 @@ def no_weights():
 
 
 @pytest.fixture
+def here(tmp_path, monkeypatch):
+    """Work in the temporary folder, which is returned."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
 def own_cache(tmp_path, monkeypatch):
     """Keep what is cached on disk to this test."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))

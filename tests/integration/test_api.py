@@ -54,10 +54,9 @@ def ball(texels, scale=2.0):
 
 
 @pytest.mark.slow
-def test_the_example_runs(tmp_path, monkeypatch, capsys):
+def test_the_example_runs(tmp_path, monkeypatch, capsys, here):
     pytest.importorskip("matplotlib")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.chdir(tmp_path)
     found = runpy.run_path(str(ROOT / "docs" / "edit_in_python.py"))
     result = found["result"]
     assert result.metrics["render"]["psnr"] > result.metrics["initial"]["psnr"] + 10
@@ -311,10 +310,9 @@ def test_importing_envedit_imports_no_mitsuba():
 
 
 @pytest.mark.slow
-def test_an_object_is_put_into_a_photograph_under_its_light(tmp_path, monkeypatch):
+def test_an_object_is_put_into_a_photograph_under_its_light(tmp_path, monkeypatch, here):
     """The example: the sun of the photograph is found, its curve too, and the box casts a shadow."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.chdir(tmp_path)
     found = runpy.run_path(str(ROOT / "docs" / "insert_in_python.py"))
     result = found["result"]
 

@@ -17,7 +17,7 @@ from envedit.images import images
 from envedit.maps import look_transfer, looks
 from envedit.targets.pixel_weights import FOLLOWING
 from tests.oracles.builders import LIGHT, write_scene
-from tests.oracles.painting import OF_TWO, SMALL, TWO_VIEWS, asked, connected, heard, served
+from tests.oracles.painting import OF_TWO, SMALL, TWO_VIEWS, asked, connected, heard, painted, send, served
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("own_core")]
 pytest.importorskip("starlette", reason="the extra envedit[paint] is not installed")
@@ -54,10 +54,10 @@ def test_save_goes_on_from_what_is_shown_and_tells_what_differs(tmp_path):
     erased = {"type": "erase-shadow", "ellipse": [0.62, 0.3, 0.12, 0.12], "softness": 0.05}
     with served(tmp_path / "edit.toml") as server, connected(server) as page:
         heard(page, "opened")
-        painted = {"strokes": [erased], "rest": "follow", "tilt_degrees": 4, "horizon_degrees": -3}
-        page.send(json.dumps({"type": "document", "number": 1, "document": painted}))
+        wanted = {"strokes": [erased], "rest": "follow", "tilt_degrees": 4, "horizon_degrees": -3}
+        send(page, "document", number=1, document=wanted)
         heard(page, "status", lambda m: m.get("number") == 1 and m["iterations"] > 1)
-        page.send(json.dumps({"type": "save"}))
+        send(page, "save")
         shown = {}
         while not isinstance(received := page.recv(timeout=120), str) or '"type":"saved"' not in received:
             if isinstance(received, bytes) and received[4] == 0:
@@ -76,13 +76,11 @@ def test_save_goes_on_from_what_is_shown_and_tells_what_differs(tmp_path):
         heard(page, "opened")
         hold = server.worker.session.solution.hold
         assert hold == FOLLOWING, "the saved solution is not what is opened"
-        page.send(json.dumps({"type": "document", "number": 2, "document": {"strokes": [erased, erased]}}))
-        heard(page, "status", lambda m: m.get("number") == 2)
+        painted(page, 2, {"strokes": [erased, erased]})
         assert "start" not in kept.read_text(), "a solution of other strokes is gone on from"
 
 
-def test_strokes_belong_to_the_view_that_was_painted_in_and_others_hold(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_strokes_belong_to_the_view_that_was_painted_in_and_others_hold(tmp_path, here):
     write_scene(tmp_path, *TWO_VIEWS, LIGHT, name="scene.xml")
     (tmp_path / "edit.toml").write_text(OF_TWO)
     square = {"rectangle": [0.3, 0.3, 0.7, 0.7], "softness": 0.05}
@@ -92,20 +90,20 @@ def test_strokes_belong_to_the_view_that_was_painted_in_and_others_hold(tmp_path
         assert heard(page, "opened")["views"] == ["front", "behind"]
         session, count = server.worker.session, 0
 
-        def painted(*strokes):
+        def solved(*strokes):
             """Return what strokes ask for in each view, and what the solution leaves of it."""
             nonlocal count
             count += 1
-            page.send(json.dumps({"type": "document", "number": count, "document": {"strokes": strokes}}))
+            send(page, "document", number=count, document={"strokes": strokes})
             heard(page, "status", lambda m: m.get("number") == count and m["state"] == "done")
             now = session.solution
             under = now.coverage
             changes = now.target - now.base, under * (now.target - now.point.rendering)
             return [change[rows] for change in changes for rows in session.scene.rows]
 
-        front, behind, _, _ = painted({**shadow, "view": 1})
+        front, behind, _, _ = solved({**shadow, "view": 1})
         assert not front.any() and behind[10:18, 11:21].mean() < -0.02 and not behind[0].any()
-        front, behind, *left = painted(light, {**shadow, "view": "behind"})
+        front, behind, *left = solved(light, {**shadow, "view": "behind"})
         assert front[6:14, 11:21].mean() > 0.05 and behind[10:18, 11:21].mean() < -0.02
         for asked, rest in zip((front, behind), left, strict=True):
             assert np.square(rest).sum() < 0.5 * np.square(asked).sum(), "not solved for together"
@@ -116,30 +114,29 @@ def test_strokes_belong_to_the_view_that_was_painted_in_and_others_hold(tmp_path
             (1, 1): (64, 56),
         }
         before = session.document
-        page.send(json.dumps({"type": "document", "document": {"strokes": [{**light, "view": 2}]}}))
+        send(page, "document", document={"strokes": [{**light, "view": 2}]})
         given = heard(page, "document")
         assert given["client"] == "" and protocol.document(given["document"]) == before == session.document
         assert "got view 2, expected one of 0 (front), 1 (behind)" in heard(page, "error")["text"]
         with connected(server) as later:
             assert protocol.document(heard(later, "opened")["document"]) == before
-        page.send(json.dumps({"type": "open", "name": "edit.toml", "envmap": "missing.exr"}))
+        send(page, "open", name="edit.toml", envmap="missing.exr")
         assert "missing.exr" in heard(page, "error")["text"] and server.worker.session is session
         toward = []
         for view in (0, 1):
-            page.send(json.dumps({"type": "pick", "x": 0.5, "y": 0.5, "light": 0, "view": view}))
+            send(page, "pick", x=0.5, y=0.5, light=0, view=view)
             toward.append(heard(page, "picked")["azimuth"])
         assert abs((toward[1] - toward[0]) % 360 - 180) < 60, toward
 
-    with open(tmp_path / "edit_out" / "painted.toml", "a") as painted:
-        painted.write('\n[[target.strokes]]\ntype = "light"\nview = 5\nellipse = [0.5, 0.5, 0.1, 0.1]\n')
+    with open(tmp_path / "edit_out" / "painted.toml", "a") as file:
+        file.write('\n[[target.strokes]]\ntype = "light"\nview = 5\nellipse = [0.5, 0.5, 0.1, 0.1]\n')
     with served(tmp_path / "edit.toml") as server, connected(server) as page:
         opened = heard(page, "opened")
         assert protocol.document(opened["document"]) == before
         assert "strokes[2].view: got view 5" in opened["notes"][0] and "left out" in opened["notes"][0]
 
 
-def test_a_scene_is_opened_from_the_start_page_and_mistakes_are_told(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_a_scene_is_opened_from_the_start_page_and_mistakes_are_told(tmp_path, here):
     (tmp_path / "edit.toml").write_text(SMALL)
     with served(None) as server, connected(server) as page:
         assert "sphere" in heard(page, "start")["scenes"]
@@ -164,19 +161,18 @@ def test_a_scene_is_opened_from_the_start_page_and_mistakes_are_told(tmp_path, m
         Path("maps").write_text("in the way")
         code, text = asked(f"{server.url}map/b.hdr", **put)
         assert code == 500 and text.startswith("not written: ") and "maps" in text, text
-        page.send(json.dumps({"type": "save"}))
+        send(page, "save")
         assert "no scene is open" in heard(page, "error")["text"]
-        page.send(json.dumps({"type": "open", "name": "nowhere.toml"}))
+        send(page, "open", name="nowhere.toml")
         assert "no such configuration" in heard(page, "error")["text"]
-        page.send(json.dumps({"type": "open", "name": "edit.toml", "envmap": "missing.exr"}))
+        send(page, "open", name="edit.toml", envmap="missing.exr")
         assert "missing.exr" in heard(page, "error")["text"]
-        page.send(json.dumps({"type": "open", "name": "edit.toml"}))
+        send(page, "open", name="edit.toml")
         assert heard(page, "opened")["width"] == 48
 
 
-def test_a_look_gives_the_painting_another_map(tmp_path, monkeypatch):
+def test_a_look_gives_the_painting_another_map(tmp_path, here):
     """Strokes and added lights stay, the map is a file, and the painting before is as it was."""
-    monkeypatch.chdir(tmp_path)
     (tmp_path / "edit.toml").write_text(SMALL)
     key = looks.RoleLight(azimuth=250.0, elevation=20.0, flux=1.5, radius=0.0, tint=(1.6, 0.89, 0.2))
     look = looks.to_toml(looks.Look(lights={"key": key}))
@@ -186,11 +182,10 @@ def test_a_look_gives_the_painting_another_map(tmp_path, monkeypatch):
     with served(tmp_path / "edit.toml") as server, connected(server) as socket:
         heard(socket, "opened")
         document = {"strokes": [stroke], "lights": [own, added], "tilt_degrees": 5.0}
-        socket.send(json.dumps({"type": "document", "document": document, "number": 1}))
-        heard(socket, "status", lambda message: message["number"] == 1)
+        painted(socket, 1, document)
         before = server.worker.session.map
         kept = (tmp_path / "edit_out" / "painted.toml").read_bytes()
-        socket.send(json.dumps({"type": "look", "name": "../dusk now.toml", "text": look}))
+        send(socket, "look", name="../dusk now.toml", text=look)
         opened = heard(socket, "opened")
         assert "maps/sunsky_dusk_now.exr" in heard(socket, "note")["text"]
         assert len(opened["document"]["strokes"]) == 1 and opened["document"]["tilt_degrees"] == 5
@@ -202,6 +197,6 @@ def test_a_look_gives_the_painting_another_map(tmp_path, monkeypatch):
         assert (tmp_path / "edit_out" / "painted.toml").read_bytes() == kept
         # ---- What is no look is refused, and the painting stays
         session = server.worker.session
-        socket.send(json.dumps({"type": "look", "name": "bad.toml", "text": look.replace("flux", "fluxx")}))
+        send(socket, "look", name="bad.toml", text=look.replace("flux", "fluxx"))
         assert "bad.toml: key.fluxx: unknown key" in heard(socket, "error")["text"]
         assert server.worker.session is session and os.listdir("maps") == ["sunsky_dusk_now.exr"]

@@ -1,5 +1,6 @@
 """``envedit paint`` in a real browser: paint, drag, undo, save, reopen."""
 
+import contextlib
 import os
 import re
 import shutil
@@ -76,12 +77,13 @@ class Page:
     def __init__(self, browser, url, made=None):
         self.page = made or browser.new_page(viewport={"width": 1280, "height": 720})
         self.page.set_default_timeout(120_000)
+        self.get = self.page.get_by_test_id
         self.faults, self.asked = [], []
         self.page.on("pageerror", lambda error: self.faults.append(str(error)))
         self.page.on("console", lambda m: self.faults.append(m.text) if m.type == "error" else None)
         self.page.on("request", lambda request: self.asked.append(request.url))
         self.page.goto(url)
-        self.status = self.page.get_by_test_id("status")
+        self.status = self.get("status")
 
     def settled(self, rendered=True):
         """Wait for the solution of the last edit and the rendering that follows it."""
@@ -103,123 +105,132 @@ class Page:
         self.page.mouse.up()
 
     def picture(self, name):
-        return self.page.get_by_test_id(name).screenshot()
+        return self.get(name).screenshot()
+
+    def named_and_legible(self):
+        assert not self.page.evaluate(UNNAMED) and not self.page.evaluate(FAINT)
 
     def shot(self, name):
         if SHOTS:
             self.page.screenshot(path=f"{SHOTS}/{name}.png")
 
 
-def test_paint_drag_undo_save_and_reopen(browser, tmp_path):
-    file = tmp_path / "edit.toml"
-    file.write_text(SMALL)
-    folder = tmp_path / "edit_out"
+@pytest.fixture
+def file(tmp_path):
+    """A configuration to paint on, in the working folder of the test."""
+    (tmp_path / "edit.toml").write_text(SMALL)
+    return tmp_path / "edit.toml"
+
+
+@contextlib.contextmanager
+def opened(browser, file, made=None):
+    """Open the page of a painting, which has no fault by the end; yields page, server and what is kept."""
     with served(file) as server:
-        page = Page(browser, server.url)
+        page = Page(browser, server.url, made)
+        yield page, server, file.parent / "edit_out" / "painted.toml"
+        assert not page.faults, page.faults
+
+
+def test_paint_drag_undo_save_and_reopen(browser, file):
+    folder = file.parent / "edit_out"
+    with opened(browser, file) as (page, server, kept):
         page.settled()
         white = np.quantile(luminance(server.worker.session.before), 0.95)
-        assert abs(float(page.page.get_by_test_id("exposure").input_value()) + np.log2(white)) <= 0.125
+        assert abs(float(page.get("exposure").input_value()) + np.log2(white)) <= 0.125
         begun = page.picture("map")
-        page.page.get_by_test_id("tool-shadow").click()
+        page.get("tool-shadow").click()
         page.drag(*(page.at("#overlay", 0.2 + 0.1 * k, 0.82) for k in range(5)))
         page.page.wait_for_function("() => envedit.log.some((e) => e.phase === 'done')")
         page.settled(False)
         page.shot("painted")
         assert page.picture("map") != begun, "the map did not follow the stroke"
-        assert 'type = "shadow"' in (folder / "painted.toml").read_text(), "the stroke was not kept"
+        assert 'type = "shadow"' in kept.read_text(), "the stroke was not kept"
         page.page.locator("#details summary").click()
-        sync_api.expect(page.page.get_by_test_id("unreachable")).to_be_visible()
-        page.page.get_by_test_id("undo").click()
-        until(lambda: "[[target.strokes]]" not in (folder / "painted.toml").read_text())
+        sync_api.expect(page.get("unreachable")).to_be_visible()
+        page.get("undo").click()
+        until(lambda: "[[target.strokes]]" not in kept.read_text())
         page.settled(False)
         assert page.picture("map") == begun, "undo did not give the map back"
-        sync_api.expect(page.page.get_by_test_id("unreachable")).to_be_hidden()
-        page.page.get_by_test_id("redo").click()
+        sync_api.expect(page.get("unreachable")).to_be_hidden()
+        page.get("redo").click()
         page.settled(False)
         x, y = page.at("[data-testid=handle-1]", 0.5, 0.5)
         painted = page.picture("map")
         page.drag((x, y), (x - 30, y + 5), (x - 60, y + 5))
-        until(lambda: "[[input.lights]]" in (folder / "painted.toml").read_text())
+        until(lambda: "[[input.lights]]" in kept.read_text())
         page.settled(False)
         assert page.picture("map") != painted, "the map did not follow the light"
-        page.page.get_by_test_id("save").click()
-        sync_api.expect(page.page.get_by_test_id("message")).to_contain_text("Saved in", timeout=240_000)
-        sync_api.expect(page.page.get_by_test_id("message")).to_contain_text("differs from the one shown")
+        page.get("save").click()
+        sync_api.expect(page.get("message")).to_contain_text("Saved in", timeout=240_000)
+        sync_api.expect(page.get("message")).to_contain_text("differs from the one shown")
         page.shot("saved")
-        assert not page.faults, page.faults
         assert all(url.startswith((server.url, "data:")) for url in page.asked), "the page asks elsewhere"
 
     saved, _ = images.load_envmap(str(folder / "edited.exr"), 64)
-    found = pipeline.run(config.load(folder / "painted.toml"), folder=None)
+    found = pipeline.run(config.load(kept), folder=None)
     assert np.abs(found.envmap - saved).max() <= 1e-3 * saved.mean(), "envedit run makes another map"
 
-    with served(folder / "painted.toml") as server:
+    with served(kept) as server:
         page = Page(browser, server.url + "?canvas=webgl2")
         page.settled(False)
-        sync_api.expect(page.page.get_by_test_id("undo")).to_be_enabled()
-        assert "elevation" in page.page.get_by_test_id("handle-1").get_attribute("aria-label")
+        sync_api.expect(page.get("undo")).to_be_enabled()
+        assert "elevation" in page.get("handle-1").get_attribute("aria-label")
         page.shot("reopened")
         assert not page.faults, page.faults
 
 
-def test_another_explanation_is_chosen(browser, tmp_path):
-    (tmp_path / "edit.toml").write_text(SMALL)
-    with served(tmp_path / "edit.toml") as server:
-        page = Page(browser, server.url)
-        sync_api.expect(page.page.get_by_test_id("handle-1")).to_be_visible(timeout=120_000)
-        holder = page.page.get_by_test_id("explanations")
+def test_another_explanation_is_chosen(browser, file):
+    with opened(browser, file) as (page, *_):
+        sync_api.expect(page.get("handle-1")).to_be_visible(timeout=120_000)
+        holder = page.get("explanations")
         sync_api.expect(holder).to_be_hidden()
-        page.page.get_by_test_id("tool-erase-shadow").click()
+        page.get("tool-erase-shadow").click()
         page.drag(*(page.at("#overlay", 0.52 + 0.04 * k, 0.3) for k in range(5)))
-        sync_api.expect(page.page.get_by_test_id("explanation-1")).to_contain_text("%")
+        sync_api.expect(page.get("explanation-1")).to_contain_text("%")
         page.settled(False)
         page.shot("explanations")
         before = page.picture("map")
-        page.page.get_by_test_id("explanation-1").click()
-        sync_api.expect(page.page.get_by_test_id("explanation-1")).to_have_attribute("aria-pressed", "true")
+        page.get("explanation-1").click()
+        sync_api.expect(page.get("explanation-1")).to_have_attribute("aria-pressed", "true")
         sync_api.expect(page.status).to_have_attribute("data-state", "done")
         assert page.picture("map") != before
-        page.page.get_by_test_id("undo").click()
+        page.get("undo").click()
         sync_api.expect(holder).to_be_hidden(timeout=120_000)
-        assert not page.faults, page.faults
 
 
-def test_a_shadow_is_dragged_and_what_goes_along_is_chosen(browser, tmp_path):
-    (tmp_path / "edit.toml").write_text(SMALL)
-    kept = tmp_path / "edit_out" / "painted.toml"
-    with served(tmp_path / "edit.toml") as server:
-        page = Page(browser, server.url)
-        sync_api.expect(page.page.get_by_test_id("handle-1")).to_be_visible(timeout=120_000)
+def test_a_shadow_is_dragged_and_what_goes_along_is_chosen(browser, file):
+    with opened(browser, file) as (page, server, kept):
+        sync_api.expect(page.get("handle-1")).to_be_visible(timeout=120_000)
         page.page.wait_for_function("() => envedit.log.some((e) => e.frame)")
         # ---- A shadow, by its tip; and where there is none; a drag is one step, however late answers come
         answered = server.worker.session.pick
         server.worker.session.pick = lambda asked: (time.sleep(0.4), answered(asked))
         page.page.keyboard.press("9")
-        message = page.page.get_by_test_id("message")
+        message = page.get("message")
         page.drag(page.at("#overlay", 0.96, 0.96), page.at("#overlay", 0.9, 0.9))
         sync_api.expect(message).to_contain_text("in no shadow of the light")
         x, y = page.at("#overlay", 10.5 / 48, 33.5 / 48)
         page.page.mouse.move(x, y)
         page.page.mouse.down()
-        until(lambda: page.page.get_by_test_id("light-panel").get_attribute("disabled") is None)
+        until(lambda: page.get("light-panel").get_attribute("disabled") is None)
         page.page.mouse.move(*page.at("#overlay", 10.5 / 48, 40.5 / 48), steps=4)
         page.page.mouse.up()
         until(lambda: kept.exists() and "[[input.lights]]" in kept.read_text())
         (light,) = config.load(kept).input.lights
         assert abs((light["azimuth"] - 90 + 180) % 360 - 180) > 20, light  # where its light stood
-        page.page.get_by_test_id("undo").click()
+        page.get("undo").click()
         until(lambda: "[[input.lights]]" not in kept.read_text())
         server.worker.session.pick = answered
         # ---- A stroke, with the sky and the rest as chosen
-        page.page.get_by_test_id("tool-shadow").click()
+        page.get("tool-shadow").click()
         page.drag(*(page.at("#overlay", 0.6 + 0.1 * k, 0.8) for k in range(4)))
         sync_api.expect(page.status).to_contain_text("% of the paint reached")
-        page.page.get_by_test_id("freedom").fill("0.6")
-        page.page.get_by_test_id("rest").select_option("keep")
+        page.get("freedom").fill("0.6")
+        page.get("rest").select_option("keep")
         until(lambda: "freedom = 0.6" in kept.read_text() and 'rest = "keep"' in kept.read_text())
-        page.page.get_by_test_id("undo").click()
+        page.get("undo").click()
         until(lambda: "rest" not in kept.read_text())
-        assert page.page.get_by_test_id("rest").input_value() == "follow"
+        assert page.get("rest").input_value() == "follow"
         # ---- What is done where little is reached
         light = {"light": 1, "flux": [0.5] * 3, "size": 1.0, "azimuth": 200, "elevation": 30}
         action = {"label": "Drag light 1 there", "change": {"lights": [light], "strokes": []}}
@@ -230,13 +241,12 @@ def test_a_shadow_is_dragged_and_what_goes_along_is_chosen(browser, tmp_path):
         until(lambda: "azimuth = 200" in kept.read_text() and "[[target.strokes]]" not in kept.read_text())
         assert config.load(kept).input.lights[0]["flux"] == [0.5, 0.5, 0.5]
         page.shot("advised")
-        assert not page.faults, page.faults
 
 
 def size_and_flux_are_dragged(page, lights):
     """By drags of its handle with a key: it stays where it is."""
     stays = {key: lights()[0][key] for key in ("azimuth", "elevation")}
-    handle = page.page.get_by_test_id("handle-2").bounding_box()
+    handle = page.get("handle-2").bounding_box()
     x, y = handle["x"] + handle["width"] / 2, handle["y"] + handle["height"] / 2
     for key, name, factor in (("Shift", "size", 2), ("Control", "flux", 0.5)):
         before = np.array(lights()[0][name])
@@ -257,7 +267,6 @@ def a_highlight_is_dragged(page, lights):
     page.page.keyboard.press("2")  # another tool is chosen before it is known whose highlight it is
     page.page.mouse.up()
     until(lambda: [light.get("azimuth") for light in lights()] != before)
-    assert not page.faults, page.faults
 
 
 def each_kind_of_stroke_is_painted(page, kept):
@@ -265,10 +274,10 @@ def each_kind_of_stroke_is_painted(page, kept):
     sliders = {"light": "amount", "contrast": "amount", "temperature": "kelvin", "blur": "radius"}
     tools = ["light", "shadow", "erase-shadow", "temperature", "contrast", "blur", "hold"]
     for count, tool in enumerate(tools, 1):
-        page.page.get_by_test_id(f"tool-{tool}").click()
-        page.page.get_by_test_id("shape-rectangle").click()
+        page.get(f"tool-{tool}").click()
+        page.get("shape-rectangle").click()
         if tool in sliders:
-            page.page.get_by_test_id(sliders[tool]).press("ArrowRight")
+            page.get(sliders[tool]).press("ArrowRight")
         page.drag(page.at("#overlay", 0.2, 0.2), page.at("#overlay", 0.3, 0.3))
         until(lambda count=count: kept.read_text().count("[[target.strokes]]") == count)
         stroke = config.load(kept).target.strokes[-1]
@@ -280,28 +289,24 @@ def an_image_is_put_on_the_light(page, lights, folder):
     """The file goes to a folder of the working folder, and the light has the image's sides."""
     softbox = folder / "softbox.png"
     images.write_png(softbox, np.linspace(0, 1, 24).reshape(2, 4, 3))
-    page.page.get_by_test_id("light-image-file").set_input_files(softbox)
+    page.get("light-image-file").set_input_files(softbox)
     until(lambda: lights()[0]["shape"] == "image" and "aspect" not in lights()[0])
     taken = folder / "images" / "softbox.png"
     assert lights()[0]["image"] == str(taken) and taken.read_bytes() == softbox.read_bytes()
     page.shot("image")
-    page.page.get_by_test_id("undo").click()
+    page.get("undo").click()
     until(lambda: lights()[0]["shape"] == "strip")
 
 
-def test_lights_are_placed_by_clicks_and_shaped(browser, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "edit.toml").write_text(SMALL)
-    kept = tmp_path / "edit_out" / "painted.toml"
+def test_lights_are_placed_by_clicks_and_shaped(browser, file, tmp_path, here):
+    with opened(browser, file) as (page, _, kept):
 
-    def lights():
-        return config.load(kept).input.lights if kept.exists() else ()
+        def lights():
+            return config.load(kept).input.lights if kept.exists() else ()
 
-    with served(tmp_path / "edit.toml") as server:
-        page = Page(browser, server.url)
-        sync_api.expect(page.page.get_by_test_id("handle-1")).to_be_visible(timeout=120_000)
+        sync_api.expect(page.get("handle-1")).to_be_visible(timeout=120_000)
         page.page.wait_for_function("() => envedit.log.some((e) => e.frame)")
-        message = page.page.get_by_test_id("message")
+        message = page.get("message")
         # ---- One new light by a drag, which is chosen then; why it cannot move; the same behind the ball
         page.page.keyboard.press("i")
         page.drag(page.at("#overlay", 0.45, 0.5), page.at("#overlay", 0.6, 0.4))
@@ -316,18 +321,18 @@ def test_lights_are_placed_by_clicks_and_shaped(browser, tmp_path, monkeypatch):
         until(lambda: abs(lights()[0]["azimuth"] - in_front["azimuth"]) > 60)
         # ---- Its shape, one step of history each
         for key, value in (("shape", "strip"), ("rotation", "30"), ("softness", "0.5"), ("aspect", "0.3")):
-            control = page.page.get_by_test_id(f"light-{key}")
+            control = page.get(f"light-{key}")
             control.select_option(value) if key == "shape" else control.fill(value)
             until(lambda key=key, value=value: str(lights()[0].get(key)) in (value, f"{value}.0"))
         page.shot("shaped")
         an_image_is_put_on_the_light(page, lights, tmp_path)
-        page.page.get_by_test_id("undo").click()
+        page.get("undo").click()
         until(lambda: lights()[0]["aspect"] == 0.1)
         size_and_flux_are_dragged(page, lights)
         # ---- Without a chosen light, the sun casts the shadow
         page.page.keyboard.press("Escape")
-        sync_api.expect(page.page.get_by_test_id("light-panel")).to_contain_text("No light chosen")
-        page.page.get_by_test_id("tool-cast").click()
+        sync_api.expect(page.get("light-panel")).to_contain_text("No light chosen")
+        page.get("tool-cast").click()
         page.page.mouse.click(*page.at("#overlay", 0.25, 0.85))
         sync_api.expect(message).to_contain_text("Light 1 casts a shadow here")
         until(lambda: any(one.get("light") == 1 for one in lights()))
@@ -343,7 +348,7 @@ def test_lights_are_placed_by_clicks_and_shaped(browser, tmp_path, monkeypatch):
 
 def lights_are_listed(page, kept):
     """The list: name, flux, size, colour, lock, mute; solo is not kept."""
-    get = page.page.get_by_test_id
+    get = page.get
 
     def write(name, value):
         get(name).fill(str(value))
@@ -377,7 +382,7 @@ def lights_are_listed(page, kept):
 
 def states_are_compared(page, kept):
     """A state A beside another; the steps as pictures."""
-    get = page.page.get_by_test_id
+    get = page.get
     first = page.picture("render")
     get("keep-a").click()
     get("list-mute-1").click()
@@ -442,10 +447,10 @@ def map_is_large_and_rendering_zoomed(page):
     page.page.locator("#overlay").focus()
     page.page.keyboard.press("m")
     sync_api.expect(page.page.locator("#sky-size")).to_have_text("64 x 32 texels")
-    page.page.get_by_test_id("sky-split").fill("0.5")
-    assert not page.page.evaluate(UNNAMED) and not page.page.evaluate(FAINT)
+    page.get("sky-split").fill("0.5")
+    page.named_and_legible()
     page.shot("large")
-    page.page.get_by_test_id("sky-close").click()
+    page.get("sky-close").click()
     rendering = page.page.locator("#overlay")
     before = rendering.bounding_box()
     page.page.mouse.move(*page.at("#render-stack", 0.25, 0.25))
@@ -455,22 +460,18 @@ def map_is_large_and_rendering_zoomed(page):
     assert rendering.bounding_box() == before
 
 
-def test_lights_listed_states_compared_the_map_large_and_zoom(browser, tmp_path):
-    (tmp_path / "edit.toml").write_text(SMALL)
-    kept = tmp_path / "edit_out" / "painted.toml"
-    with served(tmp_path / "edit.toml") as server:
-        page = Page(browser, server.url)
+def test_lights_listed_states_compared_the_map_large_and_zoom(browser, file):
+    with opened(browser, file) as (page, _, kept):
         page.settled(False)
         lights_are_listed(page, kept)
         states_are_compared(page, kept)
         map_is_large_and_rendering_zoomed(page)
         tones_are_those_of_the_package(page)
-        assert not page.faults, page.faults
 
 
 def map_is_levelled(page, kept, session):
     """The horizon by the line's grips, keys and numbers: the handle of a light goes along."""
-    get = page.page.get_by_test_id
+    get = page.get
 
     def orientation():
         return tuple(config.load(kept).input.orientation) if kept.exists() else None
@@ -500,8 +501,7 @@ def map_is_levelled(page, kept, session):
     moved = angles(Orientation(100, 12, 5).matrix @ direction(light["azimuth"], light["elevation"]))
     assert moved == pytest.approx((azimuth + 1, elevation), abs=0.05)
     page.shot("level")
-    assert not page.page.evaluate(UNNAMED)
-    assert not page.page.evaluate(FAINT)
+    page.named_and_legible()
     get("undo").click()
     get("undo").click()
     until(lambda: orientation() == (0, 12, 5))
@@ -509,7 +509,7 @@ def map_is_levelled(page, kept, session):
 
 def lights_are_ordered(page, kept):
     """Roles, and the order of the list by buttons and keys."""
-    get = page.page.get_by_test_id
+    get = page.get
 
     def lights():
         return [(one.get("light"), one.get("role")) for one in config.load(kept).input.lights]
@@ -530,7 +530,7 @@ def lights_are_ordered(page, kept):
 
 def regions_are_painted(page, kept, session):
     """A brush on the rotated map, its settings, keys, and a region that is taken away."""
-    get = page.page.get_by_test_id
+    get = page.get
 
     def regions():
         return config.load(kept).input.regions
@@ -561,8 +561,7 @@ def regions_are_painted(page, kept, session):
     until(lambda: [one["action"] for one in regions()] == ["scale", "keep"])
     assert len(regions()[1]["points"]) == 2 and regions()[1]["radius"] == 5
     page.shot("regions")
-    assert not page.page.evaluate(UNNAMED)
-    assert not page.page.evaluate(FAINT)
+    page.named_and_legible()
     get("region-remove").click()
     until(lambda: len(regions()) == 1)
     page.page.keyboard.press("g")
@@ -572,9 +571,7 @@ def regions_are_painted(page, kept, session):
     until(lambda: [one["action"] for one in regions()] == ["scale"])
 
 
-def test_a_map_is_chosen_levelled_and_painted_and_lights_are_ordered(browser, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "edit.toml").write_text(SMALL)
+def test_a_map_is_chosen_levelled_and_painted_and_lights_are_ordered(browser, file, tmp_path, here):
     images.write_exr("sky.exr", analytic_sky.sunsky(64, 200, 30, 3), {})
     images.write_exr("picture.exr", np.ones((30, 40, 3)), panorama=False)
     kept = tmp_path / "edit_out" / "painted.toml"
@@ -588,10 +585,9 @@ def test_a_map_is_chosen_levelled_and_painted_and_lights_are_ordered(browser, tm
         tile.click()
         sync_api.expect(tile).to_have_attribute("aria-pressed", "true")
         page.shot("start")
-        assert not page.page.evaluate(UNNAMED)
-        assert not page.page.evaluate(FAINT)
-        page.page.get_by_test_id("open-name").fill("edit.toml")
-        page.page.get_by_test_id("open").click()
+        page.named_and_legible()
+        page.get("open-name").fill("edit.toml")
+        page.get("open").click()
         page.page.wait_for_function("() => envedit.log.some((e) => e.frame)")
         map_is_levelled(page, kept, server.worker.session)
         assert config.load(kept).input.envmap == str(tmp_path / "sky.exr")
@@ -602,8 +598,8 @@ def test_a_map_is_chosen_levelled_and_painted_and_lights_are_ordered(browser, tm
             looks.Look(lights={"key": looks.RoleLight(90.0, 30.0, 2.0, 0.0, (1.0, 1.0, 1.0))})
         )
         file = {"name": "noon.toml", "mimeType": "", "buffer": look.encode()}
-        page.page.get_by_test_id("look-file").set_input_files(file)
-        sync_api.expect(page.page.get_by_test_id("message")).to_contain_text("maps/sky_noon.exr")
+        page.get("look-file").set_input_files(file)
+        sync_api.expect(page.get("message")).to_contain_text("maps/sky_noon.exr")
         until(
             lambda: np.allclose(server.worker.session.placed.lights[0].direction, direction(90, 30), atol=0.1)
         )
@@ -614,8 +610,7 @@ def test_a_map_is_chosen_levelled_and_painted_and_lights_are_ordered(browser, tm
 def test_views_as_tabs_names_focus_order_and_contrast(browser, tmp_path):
     write_scene(tmp_path, *TWO_VIEWS, LIGHT, name="scene.xml")
     (tmp_path / "edit.toml").write_text(OF_TWO)
-    with served(tmp_path / "edit.toml") as server:
-        page = Page(browser, server.url)
+    with opened(browser, tmp_path / "edit.toml") as (page, _, kept):
         tabs = page.page.get_by_role("tab")
         sync_api.expect(tabs.nth(0)).to_be_visible(timeout=120_000)
         page.page.wait_for_function("() => envedit.log.some((e) => e.frame)")
@@ -628,19 +623,17 @@ def test_views_as_tabs_names_focus_order_and_contrast(browser, tmp_path):
         second = page.page.evaluate(ratio)
         assert first["width"] / first["height"] == pytest.approx(32 / 20, rel=0.02)
         assert second["width"] / second["height"] == pytest.approx(32 / 28, rel=0.02)
-        page.page.get_by_test_id("tool-light").click()
-        page.page.get_by_test_id("shape-rectangle").click()
-        stops = float(page.page.get_by_test_id("exposure").input_value())
+        page.get("tool-light").click()
+        page.get("shape-rectangle").click()
+        stops = float(page.get("exposure").input_value())
         page.drag(page.at("#overlay", 0.3, 0.3), page.at("#overlay", 0.7, 0.7))
-        kept = tmp_path / "edit_out" / "painted.toml"
         until(lambda: kept.exists() and "view = 1" in kept.read_text())
         (stroke,) = config.load(kept).target.strokes
         assert stroke["amount"] == pytest.approx(0.6 / 2**stops, rel=1e-3), "not of what is shown as white"
         page.shot("views")
 
-        assert not page.page.evaluate(UNNAMED)
-        assert not page.page.evaluate(FAINT)
-        page.page.get_by_test_id("undo").focus()
+        page.named_and_legible()
+        page.get("undo").focus()
         reached = []
         while len(reached) < 60 and "map-exposure" not in reached:
             page.page.keyboard.press("Tab")
@@ -651,13 +644,11 @@ def test_views_as_tabs_names_focus_order_and_contrast(browser, tmp_path):
         order = ["save", "tool-light", "shape-brush", "softness", "view-1", "overlay", "handle-1",
                  "tool-turn", "map-exposure"]  # fmt: skip
         assert [name for name in reached if name in order] == order, reached
-        assert not page.faults, page.faults
 
 
 def test_a_photograph_is_compared_with_the_rendering(browser, tmp_path):
-    with served(photographed(tmp_path)) as server:
-        page = Page(browser, server.url)
-        get = page.page.get_by_test_id
+    with opened(browser, photographed(tmp_path)) as (page, *_):
+        get = page.get
         sync_api.expect(get("reference")).to_have_value("2")
         page.settled(False)
         matched = page.picture("render")
@@ -671,16 +662,12 @@ def test_a_photograph_is_compared_with_the_rendering(browser, tmp_path):
         assert page.picture("render") == photograph, "the photograph follows the edit"
         get("reference").select_option("0")
         assert page.picture("render") != photograph
-        assert not page.faults, page.faults
 
 
-def test_fingers_paint_and_zoom_on_a_tablet(browser, tmp_path):
-    (tmp_path / "edit.toml").write_text(SMALL)
-    kept = tmp_path / "edit_out" / "painted.toml"
-    with served(tmp_path / "edit.toml") as server:
-        context = browser.new_context(viewport={"width": 820, "height": 1180}, has_touch=True)
-        page = Page(browser, server.url, context.new_page())
-        sync_api.expect(page.page.get_by_test_id("handle-1")).to_be_visible(timeout=120_000)
+def test_fingers_paint_and_zoom_on_a_tablet(browser, file):
+    context = browser.new_context(viewport={"width": 820, "height": 1180}, has_touch=True)
+    with opened(browser, file, context.new_page()) as (page, _, kept):
+        sync_api.expect(page.get("handle-1")).to_be_visible(timeout=120_000)
         touch = context.new_cdp_session(page.page)
 
         def fingers(kind, *places):
@@ -707,5 +694,4 @@ def test_fingers_paint_and_zoom_on_a_tablet(browser, tmp_path):
             page.page.set_viewport_size({"width": width, "height": height})
             assert page.page.evaluate("document.documentElement.scrollWidth") == width
         page.shot("tablet")
-        assert not page.faults, page.faults
-        context.close()
+    context.close()

@@ -17,7 +17,7 @@ import pytest
 
 from envedit.cli.paint import protocol
 from envedit.cli.paint.protocol import Document
-from tests.oracles.painting import SMALL, asked, connected, heard, served, until
+from tests.oracles.painting import SMALL, asked, connected, heard, painted, send, served, until
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("own_core")]
 pytest.importorskip("starlette", reason="the extra envedit[paint] is not installed")
@@ -62,13 +62,8 @@ def test_without_the_token_or_from_elsewhere_nobody_is_let_in(server):
 
 
 def test_no_other_file_is_served_or_written(server):
-    for name in (
-        "../secret.txt",
-        "..%2fsecret.txt",
-        "result/..%2f..%2fsecret.txt",
-        "result/painted.toml",
-        "x.py",
-    ):
+    outside = "../secret.txt", "..%2fsecret.txt", "result/..%2f..%2fsecret.txt"
+    for name in (*outside, "result/painted.toml", "x.py"):
         code, text = asked(server.url + name)
         assert code in (403, 404) and "not to be served" not in text, name
     put = {"method": "PUT", "data": b"#?RADIANCE", "headers": {"Origin": server.origins[0]}}
@@ -107,7 +102,7 @@ def test_bad_messages_are_told_and_huge_ones_end_the_connection(server):
         assert "expected JSON" in heard(page, "refused")["text"]
         page.send(b"\x00" * 100)
         assert "expected JSON text" in heard(page, "refused")["text"]
-        page.send(json.dumps({"type": "document", "document": {"strokes": 3}}))
+        send(page, "document", document={"strokes": 3})
         assert "document.strokes" in heard(page, "refused")["text"]
         heard(page, "status")  # it goes on
         with pytest.raises(exceptions.ConnectionClosed) as closed:
@@ -125,7 +120,7 @@ def test_two_pages_see_one_painting_and_one_that_comes_back_has_it_all(server):
         mine = heard(one, "hello")["client"]
         assert heard(other, "hello")["client"] != mine
         heard(one, "opened"), heard(other, "opened")
-        one.send(json.dumps({"type": "document", "number": 5, "document": {"strokes": [stroke]}}))
+        send(one, "document", number=5, document={"strokes": [stroke]})
         assert heard(other, "document")["document"]["strokes"][0]["type"] == "light"
         done = heard(
             other, "status", lambda m: m["state"] == "done" and m.get("number") == 5 and m["iterations"]
@@ -139,8 +134,7 @@ def test_two_pages_see_one_painting_and_one_that_comes_back_has_it_all(server):
             frames |= {received[4]} if isinstance(received, bytes) else set()
         reach = heard(again, "status", lambda m: m.get("reachable") is not None)["reachable"]
         assert 0 < reach <= 1
-        again.send(json.dumps({"type": "document", "number": 6, "document": {}}))
-        heard(again, "status", lambda m: m.get("number") == 6)
+        painted(again, 6, {})
     until(lambda: server.worker.session.document == Document())
 
 
@@ -148,7 +142,7 @@ def test_done_is_told_once_and_what_goes_on_by_one_word_each(server):
     stroke = {"type": "erase-shadow", "ellipse": [0.62, 0.3, 0.12, 0.12], "softness": 0.05}
     told, kept = [], {"strokes": [stroke], "rest": "keep"}
     with connected(server) as page:
-        page.send(json.dumps({"type": "document", "number": 20, "document": kept}))
+        send(page, "document", number=20, document=kept)
         while not told or told[-1] != "done":
             status = heard(page, "status", lambda m: m.get("number") == 20)
             told.append(status["state"])
@@ -159,25 +153,24 @@ def test_done_is_told_once_and_what_goes_on_by_one_word_each(server):
                 told += [json.loads(received).get("state")] if isinstance(received, str) else []
         states = [state for state, _ in itertools.groupby(filter(None, told))]
         assert states == ["solving", "rendering", "done"]
-        page.send(json.dumps({"type": "document", "number": 21, "document": {}}))
-        heard(page, "status", lambda m: m.get("number") == 21)
+        painted(page, 21, {})
 
 
 def test_a_highlight_tells_its_light_and_the_light_follows_a_pixel(server):
     with connected(server) as page:
         heard(page, "lights")
-        page.send(json.dumps({"type": "pick", "x": 0.3, "y": 0.15, "number": 1}))
+        send(page, "pick", x=0.3, y=0.15, number=1)
         assert heard(page, "picked")["light"] == 0
         found = []
         for x in (0.4, 0.6):  # on the sphere, to the left and to the right of its middle
-            page.send(json.dumps({"type": "pick", "x": x, "y": 0.45, "light": 0, "number": 2}))
+            send(page, "pick", x=x, y=0.45, light=0, number=2)
             found.append(heard(page, "picked")["azimuth"])
         turned = (found[1] - found[0] + 180) % 360 - 180
         assert abs(turned) > 10, found
-        page.send(json.dumps({"type": "pick", "x": 0.5, "y": 0.45, "light": 0, "number": 3}))
+        send(page, "pick", x=0.5, y=0.45, light=0, number=3)
         reflected = heard(page, "picked")
         assert abs(reflected["azimuth"] - 180) < 5 and abs(reflected["elevation"] - 25) < 5, reflected
-        page.send(json.dumps({"type": "pick", "x": 0.5, "y": 0.9, "light": 0, "number": 4}))
+        send(page, "pick", x=0.5, y=0.9, light=0, number=4)
         floor = heard(page, "picked")
         assert "not glossy" in floor["text"] and "azimuth" not in floor, floor
 
@@ -187,13 +180,10 @@ def test_a_light_that_was_placed_is_told_with_the_number_of_its_edit(server):
         bare = shown(page)
         light = {"light": 1, "azimuth": 270.0, "elevation": 40.0}
         for number, phase in ((9, "dragging"), (10, "done")):
-            edit = {"type": "document", "number": number, "phase": phase, "document": {"lights": [light]}}
-            page.send(json.dumps(edit))
-            heard(page, "status", lambda m, number=number: m.get("number") == number)
-        page.send(json.dumps({"type": "document", "number": 11, "document": {"lights": [light]}}))
+            painted(page, number, {"lights": [light]}, phase=phase)
+        send(page, "document", number=11, document={"lights": [light]})
         moved = shown(page)
-        page.send(json.dumps({"type": "document", "number": 12, "document": {}}))
-        heard(page, "status", lambda m: m.get("number") == 12)
+        painted(page, 12, {})
     left, right = (slice(36, 39), slice(8, 11)), (slice(36, 39), slice(40, 43))
     assert moved[left].mean() > 1.5 * bare[left].mean(), "its shadow is still where it was"
     assert moved[right].mean() < bare[right].mean()

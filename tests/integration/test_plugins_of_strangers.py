@@ -116,9 +116,8 @@ def test_a_name_that_only_a_foreign_file_provides_is_refused(
     assert set(map(str, mi.file_resolver())) <= {*before, str(installed_plugins.installation())}
 
 
-def test_a_dict_names_installed_plugins_only(shared_object, mark, tmp_path, monkeypatch):
+def test_a_dict_names_installed_plugins_only(shared_object, mark, tmp_path, here):
     provide(shared_object, tmp_path)
-    monkeypatch.chdir(tmp_path)
     with pytest.raises(InputError, match=r"no plugin evil, and plugins/evil\.so is not loaded"):
         scene.load({"type": "scene", "inner": {"type": "twosided", "shape": {"type": "evil"}}})
     assert not mark.exists()

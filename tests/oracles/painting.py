@@ -117,6 +117,16 @@ def heard(socket, kind, wanted=lambda message: True):
                 return message
 
 
+def send(socket, kind, **message):
+    socket.send(json.dumps({"type": kind} | message))
+
+
+def painted(socket, number, document, **more):
+    """Send a painting, and return the first status that is of it."""
+    send(socket, "document", number=number, document=document, **more)
+    return heard(socket, "status", lambda message: message.get("number") == number)
+
+
 def asked(address, **more):
     """Return status and body of an HTTP request."""
     try:

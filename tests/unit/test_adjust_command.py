@@ -13,6 +13,7 @@ from envedit.images import images
 from envedit.maps import map_file, sphere
 from envedit.maps.adjusted import Adjustments, adjusted
 from envedit.representations.layers import oriented
+from tests.oracles.maps import flux
 
 HEIGHT, WIDTH = 64, 128
 
@@ -21,10 +22,6 @@ def sunny(rng, at=(20, 33), peak=20000.0):
     envmap = rng.uniform(0.2, 0.4, (HEIGHT, WIDTH, 3)).astype(np.float32)
     envmap[at] = peak, 0.8 * peak, 0.6 * peak
     return envmap
-
-
-def flux(envmap):
-    return np.einsum("h,hwc->c", latlong.lookup_solid_angles(*envmap.shape[:2]), np.float64(envmap))
 
 
 def brightest(envmap):
@@ -88,8 +85,7 @@ def test_an_even_map_stays_even(value):
     np.testing.assert_allclose(found, envmap, rtol=1e-5)
 
 
-def test_the_command_keeps_format_and_colour_space_and_writes_a_backplate(rng, tmp_path, capsys, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_the_command_keeps_format_and_colour_space_and_writes_a_backplate(rng, capsys, here):
     sky = sunny(rng, peak=500.0)
     images.write_exr("sky.exr", sky, half=True, chromaticities=primaries.ACES_AP1)
     given = [
@@ -123,8 +119,7 @@ def test_the_command_keeps_format_and_colour_space_and_writes_a_backplate(rng, t
         (["--exposure", "100", "--out", "a.exr"], 5, "leaves float32"),
     ],
 )
-def test_bad_options_are_one_line(options, code, says, rng, tmp_path, capsys, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_bad_options_are_one_line(options, code, says, rng, tmp_path, capsys, here):
     images.write_hdr("sky.hdr", 1e10 * sunny(rng))
     assert adjust.main(["sky.hdr", *options]) == code
     err = capsys.readouterr().err

@@ -11,6 +11,7 @@ from envedit.export import adjustments
 from envedit.images import images
 from envedit.targets.strokes import gains
 from tests.oracles import users_scenes
+from tests.oracles.maps import flux
 from tests.oracles.runs import call, changed, measured, pixels
 
 HEIGHT, WIDTH = 64, 128
@@ -20,10 +21,6 @@ def sunny(rng, value=5000.0, at=(12, 3)):
     envmap = (0.5 + 0.05 * rng.random((HEIGHT, WIDTH, 3))).astype(np.float32)
     envmap[at] = [value, 0.8 * value, 0.6 * value]
     return envmap
-
-
-def flux(envmap):
-    return (np.float64(envmap) * latlong.lookup_solid_angles(*envmap.shape[:2])[:, None, None]).sum((0, 1))
 
 
 def adjusted(envmap, scale=1.0, lights=None, **output):

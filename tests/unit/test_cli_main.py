@@ -106,12 +106,6 @@ def test_python_m_envedit_is_the_command(arguments, code):
 # ---- configurations by name --------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def here(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
 @pytest.mark.parametrize("name", shipped.configurations())
 def test_a_shipped_configuration_by_name(name, here):
     settings, file, base = run.load(name, None, [])
@@ -160,8 +154,7 @@ def test_a_configuration_that_is_not_there(wrong, says, here, capsys):
     assert capsys.readouterr().err == f"envedit: {wrong}: no such configuration file; {says}\n"
 
 
-def test_each_scene_xml_has_a_folder_of_results_with_its_own_folders_name(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_each_scene_xml_has_a_folder_of_results_with_its_own_folders_name(tmp_path, here):
     names = {"kitchen/scene.xml": "kitchen_scene_out", "hall/scene.xml": "hall_scene_out"}
     names |= {"scene.xml": "scene_out", "hall/lamp.xml": "lamp_out"}
     for scene, folder in names.items():

@@ -13,8 +13,7 @@ HEIGHT, WIDTH = 32, 64
 
 
 @pytest.fixture
-def said(tmp_path, capsys, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def said(tmp_path, capsys, monkeypatch, here):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))  # without weights of networks
 
     def run(first, second):

@@ -10,11 +10,7 @@ from envedit import config
 from envedit.cli import init
 from envedit.core import shipped
 
-
-@pytest.fixture(autouse=True)
-def here(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
+pytestmark = pytest.mark.usefixtures("here")
 
 
 def test_the_file_loads_to_the_defaults_that_it_spells_out(here, capsys):

@@ -144,8 +144,7 @@ def test_a_file_holds_the_look_and_a_bad_one_names_its_key(tmp_path):
             looks.read(path)
 
 
-def test_the_command_writes_maps_of_the_files_own_size_and_format(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
+def test_the_command_writes_maps_of_the_files_own_size_and_format(tmp_path, here, capsys):
     looks.write("evening.toml", EVENING)
     images.write_exr("a.exr", sky(True), half=True)
     images.write_hdr("b.hdr", sky(False))

@@ -52,8 +52,7 @@ def test_a_value_that_is_not_finite_reaches_no_file(sky, tmp_path):
         assert not (tmp_path / name).exists()
 
 
-def test_results_have_names_of_their_own(sky, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_results_have_names_of_their_own(sky, tmp_path, here):
     images.write_hdr("sky.hdr", sky)
     (tmp_path / "link.hdr").symlink_to("sky.hdr")
     named = [map_file.output_path(None, "adjusted", [source]) for source in ("x/sky.hdr", "sky.EXR", "a.png")]

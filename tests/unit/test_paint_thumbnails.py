@@ -27,8 +27,7 @@ def made(files, seconds=60):
     return told
 
 
-def test_maps_of_a_folder_have_pictures_and_what_is_none_has_not(tmp_path, monkeypatch, rng):
-    monkeypatch.chdir(tmp_path)
+def test_maps_of_a_folder_have_pictures_and_what_is_none_has_not(tmp_path, here, rng):
     # Modules of the folder are not run by the process that reads its files.
     for name in ("numpy", "mitsuba", "base64"):
         (tmp_path / f"{name}.py").write_text("open('ran', 'w')")

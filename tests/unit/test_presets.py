@@ -11,11 +11,6 @@ from envedit.core.errors import ConfigError
 # ---- presets -----------------------------------------------------------------------------------------------
 
 
-def test_standard_is_the_defaults_and_the_presets_are_named():
-    assert presets.PRESETS["standard"] == {}
-    assert tuple(cfg.presets.PRESETS) == ("draft", "standard", "paper")
-
-
 def test_the_paper_preset_is_section_6():
     paper = cfg.loads("", preset="paper")
     siren = cfg.Representation("siren", "auto", False, 256, 6, 30.0, coordinates="plane")
@@ -164,7 +159,7 @@ def test_a_map_that_overrides_a_turn_replaces_it_and_the_other_way_round():
 # ---- files and paths ---------------------------------------------------------------------------------------
 
 
-def test_paths_are_relative_to_the_file(tmp_path, monkeypatch):
+def test_paths_are_relative_to_the_file(tmp_path, here):
     folder = tmp_path / "project"
     folder.mkdir()
     text = (
@@ -172,7 +167,6 @@ def test_paths_are_relative_to_the_file(tmp_path, monkeypatch):
         "[target]\nkind = 'image'\nfile = '/abs/t.png'\nmask = 'm.png'\n"
     )
     (folder / "edit.v2.toml").write_bytes(b"\xef\xbb\xbf" + text.replace("\n", "\r\n").encode())
-    monkeypatch.chdir(tmp_path)
     config = cfg.load("project/edit.v2.toml", overrides=["target.mask=n.png"])
     assert config.input.envmap == str(folder / "maps/sky.exr")
     assert config.scene.file == str(folder / "room.xml")

@@ -120,11 +120,10 @@ def test_chromaticities_that_are_no_primaries_are_refused(space, tmp_path, rng):
 
 @pytest.mark.slow
 @on_cpu
-def test_acescg_goes_out_if_it_came_in(tmp_path, isolated, capsys, monkeypatch):
+def test_acescg_goes_out_if_it_came_in(tmp_path, isolated, capsys, here):
     """An edit of an ACEScg map is written in ACEScg; texels that are not edited keep their bits."""
     parts = users_scenes.PATH, users_scenes.SENSOR, users_scenes.BALL, users_scenes.light(0.7)
     path = users_scenes.write(tmp_path, parts)
-    monkeypatch.chdir(tmp_path)
     own = pixels(tmp_path / "own.exr")
     images.write_exr(tmp_path / "own.exr", own, chromaticities=ACES_AP1)
     lit, radiance, _ = users_scenes.loaded(path)

@@ -103,15 +103,6 @@ def test_layers_are_not_made_without_an_image():
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_decoded_map_is_an_image_of_finite_radiance(kind):
-    representation = make(kind)
-    image = np.repeat(EXTREMES, 4, axis=0).repeat(4, axis=1)
-    decoded = representation.decode(representation.encode(image))
-    assert isinstance(decoded, mi.TensorXf) and decoded.shape == image.shape
-    assert np.isfinite(decoded.numpy()).all() and (decoded.numpy() >= 0).all()
-
-
-@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("shift", [-1e3, -5.0, 5.0, 1e3])
 def test_decoded_map_stays_finite_wherever_the_parameters_go(kind, shift, rng):
     representation = make(kind)

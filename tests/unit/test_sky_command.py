@@ -54,8 +54,7 @@ def test_the_sun_of_the_map_is_at_that_azimuth_from_north_and_elevation(tmp_path
     assert toward @ expected > np.cos(np.radians(360 / 128)) and 240 < said["azimuth"] < 280
 
 
-def test_a_sun_by_its_angles_and_a_name_that_is_free(tmp_path, capsys, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_a_sun_by_its_angles_and_a_name_that_is_free(capsys, here):
     for name in ("sky.exr", "sky_2.exr"):
         assert sky.main(["--elevation", "30", "--width", "32", "--json"]) == 0
         said = json.loads(capsys.readouterr().out)
@@ -82,8 +81,7 @@ PLACE = ["--place", "47", "8"]
         (["--elevation", "30", "--width", "7"], "width must be even"),
     ],
 )
-def test_bad_options_are_one_line(options, says, tmp_path, capsys, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_bad_options_are_one_line(options, says, tmp_path, capsys, here):
     assert sky.main(options) == 2
     err = capsys.readouterr().err
     assert says in err and len(err.splitlines()) == 1 and not list(tmp_path.iterdir())

@@ -21,6 +21,12 @@ from tests.oracles.plain import lookup
 SCENES = ROOT / "scenes"
 
 
+@pytest.fixture
+def loaded(tmp_path):
+    """A ball under a map."""
+    return scene.load(write_scene(tmp_path, SENSOR, BALL, LIGHT))
+
+
 # ---- rendering ---------------------------------------------------------------------------------------------
 
 
@@ -64,9 +70,8 @@ def test_russian_roulette_begins_where_the_scene_says(tmp_path, rng):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("row", [0, -1])
-def test_light_in_the_row_of_a_pole_alone_is_seen(row, tmp_path):
+def test_light_in_the_row_of_a_pole_alone_is_seen(row, loaded):
     """As in the sum with another map, as rendering is linear."""
-    loaded = scene.load(write_scene(tmp_path, SENSOR, BALL, LIGHT))
     pole = np.zeros((16, 32, 3), np.float32)
     pole[row] = 100
     even = np.full_like(pole, 0.1)
@@ -74,16 +79,14 @@ def test_light_in_the_row_of_a_pole_alone_is_seen(row, tmp_path):
     assert alone > 0.01 and alone == pytest.approx(both - faint, rel=0.02)
 
 
-def test_convex_body_in_a_white_furnace_shows_its_albedo(tmp_path):
-    loaded = scene.load(write_scene(tmp_path, SENSOR, BALL, LIGHT))
+def test_convex_body_in_a_white_furnace_shows_its_albedo(loaded):
     picture = loaded.render(np.ones((8, 16, 3)), spp=256)
     np.testing.assert_allclose(picture[0, 0], 1.0, rtol=1e-6)
     np.testing.assert_allclose(picture[5:7, 7:9].mean(axis=(0, 1)), [0.2, 0.4, 0.6], rtol=0.02)
 
 
 @pytest.mark.slow
-def test_resolution_may_change_between_renderings(tmp_path, rng):
-    loaded = scene.load(write_scene(tmp_path, SENSOR, BALL, LIGHT))
+def test_resolution_may_change_between_renderings(tmp_path, rng, loaded):
     small, large = sky(rng), sky(rng, 32, 64)
     first = loaded.render(small, spp=8)
     other = loaded.render(large, spp=8)
@@ -105,8 +108,7 @@ def test_rendering_is_linear_in_the_map_plus_the_other_lamps(tmp_path, rng):
 
 
 @pytest.mark.slow
-def test_passes_have_their_own_seeds_and_average_to_the_whole(tmp_path, rng, monkeypatch):
-    loaded = scene.load(write_scene(tmp_path, SENSOR, BALL, LIGHT))
+def test_passes_have_their_own_seeds_and_average_to_the_whole(loaded, rng, monkeypatch):
     image = sky(rng)
     whole = loaded.render(image, spp=10)
     calls = []
@@ -126,9 +128,8 @@ def test_passes_have_their_own_seeds_and_average_to_the_whole(tmp_path, rng, mon
 
 
 @pytest.mark.slow
-def test_auto_takes_as_many_samples_as_noise_asks_for(tmp_path, rng):
+def test_auto_takes_as_many_samples_as_noise_asks_for(loaded, rng):
     """A lone bright texel over a rough ball is noisier than an even sky."""
-    loaded = scene.load(write_scene(tmp_path, SENSOR, BALL, LIGHT))
     even = np.ones((8, 16, 3), np.float32)
     sunny = 0.05 * even
     sunny[2, 3] = 300
@@ -146,32 +147,28 @@ def test_auto_takes_as_many_samples_as_noise_asks_for(tmp_path, rng):
 
 
 @pytest.mark.slow
-def test_noise_that_does_not_fall_ends_at_the_most_samples(tmp_path, monkeypatch):
-    loaded = scene.load(write_scene(tmp_path, SENSOR, BALL, LIGHT))
+def test_noise_that_does_not_fall_ends_at_the_most_samples(loaded, monkeypatch):
     monkeypatch.setattr(scene, "QUIET_DECIBELS", 200.0)
     assert loaded.sampled(np.ones((8, 16, 3)), "auto")[1] == 768
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("value", [0.0, 1e-30, 65504.0, 1e6])
-def test_extreme_maps_render_in_proportion(tmp_path, value):
-    loaded = scene.load(write_scene(tmp_path, SENSOR, BALL, LIGHT))
+def test_extreme_maps_render_in_proportion(loaded, value):
     one = loaded.render(np.ones((8, 16, 3)), spp=8)
     many = loaded.render(np.full((8, 16, 3), value), spp=8)
     np.testing.assert_allclose(many, one * np.float32(value), rtol=1e-4)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -1e-3, 1e300])
-def test_a_bad_texel_is_named_and_not_rendered(tmp_path, value):
-    loaded = scene.load(write_scene(tmp_path, SENSOR, BALL, LIGHT))
+def test_a_bad_texel_is_named_and_not_rendered(loaded, value):
     image = np.ones((8, 16, 3))
     image[3, 5, 1] = value
     with pytest.raises(NumericalError, match=r"1 texels .* row 3, column 5: \S+ in G"):
         loaded.render(image)
 
 
-def test_a_non_finite_rendering_is_refused(tmp_path, monkeypatch):
-    loaded = scene.load(write_scene(tmp_path, SENSOR, BALL, LIGHT))
+def test_a_non_finite_rendering_is_refused(loaded, monkeypatch):
     picture = np.ones((12, 16, 3))
     picture[2, 7, 0] = np.nan
     monkeypatch.setattr(film, "render", lambda *a, **k: picture)
@@ -180,15 +177,15 @@ def test_a_non_finite_rendering_is_refused(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("given", [{"spp": 0}, {"spp": 1.5}, {"seed": -1}, {"max_depth": -2}, {"spp": True}])
-def test_unusable_rendering_settings_are_refused(tmp_path, given):
+def test_unusable_rendering_settings_are_refused(loaded, given):
     with pytest.raises(ConfigError, match=next(iter(given))):
-        scene.load(write_scene(tmp_path, SENSOR, BALL, LIGHT)).render(np.ones((8, 16, 3)), **given)
+        loaded.render(np.ones((8, 16, 3)), **given)
 
 
 @pytest.mark.parametrize("image", [np.ones((8, 16)), np.ones((8, 16, 4)), np.ones((2, 4, 3)), "sky.exr"])
-def test_a_map_of_the_wrong_shape_is_refused(tmp_path, image):
+def test_a_map_of_the_wrong_shape_is_refused(loaded, image):
     with pytest.raises(InputError):
-        scene.load(write_scene(tmp_path, SENSOR, BALL, LIGHT)).set_envmap(image)
+        loaded.set_envmap(image)
 
 
 @pytest.mark.slow

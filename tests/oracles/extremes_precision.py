@@ -76,22 +76,13 @@ def _cases(name):
     return [*(pair(scale) for scale in SCALES), wild()]
 
 
-def _value(name):
+def _loss(name, part):
+    """Measure the value of a loss, part 0, or its gradient, part 1."""
+
     def measure():
-        worst = 0.0
-        for x, y in _cases(name):
-            worst = max(worst, error(loss_and_gradient(name, x, y)[0], plain(name, x, y)[0]))
-        return worst
-
-    return measure
-
-
-def _gradient(name):
-    def measure():
-        worst = 0.0
-        for x, y in _cases(name):
-            worst = max(worst, error(loss_and_gradient(name, x, y)[1], plain(name, x, y)[1]))
-        return worst
+        return max(
+            error(loss_and_gradient(name, x, y)[part], plain(name, x, y)[part]) for x, y in _cases(name)
+        )
 
     return measure
 
@@ -118,15 +109,11 @@ def _sum_under_sun():
 
 
 def _resize():
-    worst = 0.0
-    for m in (sunny(1e5, 1e-5)[:256], *wild((64, 128, 3))):
-        small = latlong.resize(m, 32, 64).astype(np.float64)
-        light = [
-            (e.astype(np.float64) * latlong.solid_angles(*e.shape[:2])[:, None, None]).sum()
-            for e in (small, m)
-        ]
-        worst = max(worst, error(*light))
-    return worst
+    def light(m):
+        return (m.astype(np.float64) * latlong.solid_angles(*m.shape[:2])[:, None, None]).sum()
+
+    maps = sunny(1e5, 1e-5)[:256], *wild((64, 128, 3))
+    return max(error(light(latlong.resize(m, 32, 64)), light(m)) for m in maps)
 
 
 def _transport(adjoint):
@@ -257,11 +244,10 @@ def _adam():
 
 def _judged(function, reference):
     def measure():
-        worst = 0.0
-        for a, b in _cases(""):
-            wide = a.astype(np.float64), b.astype(np.float64)
-            worst = max(worst, error(function(a, b), reference(*wide)))
-        return worst
+        return max(
+            error(function(a, b), reference(a.astype(np.float64), b.astype(np.float64)))
+            for a, b in _cases("")
+        )
 
     return measure
 
@@ -322,9 +308,9 @@ _GRADIENTS = {
     "tv": (3e-7, "sums of signs"),
 }
 
-CHECKS = {f"loss `{name}`": Check(_value(name), *_VALUES[name]) for name in LOSSES}
+CHECKS = {f"loss `{name}`": Check(_loss(name, 0), *_VALUES[name]) for name in LOSSES}
 CHECKS |= {
-    f"gradient of `{name}`": Check(_gradient(name), *_GRADIENTS.get(name, (3e-7, "a few roundings")))
+    f"gradient of `{name}`": Check(_loss(name, 1), *_GRADIENTS.get(name, (3e-7, "a few roundings")))
     for name in LOSSES
 }
 CHECKS |= {

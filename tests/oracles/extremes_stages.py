@@ -23,7 +23,8 @@ from envedit.scene import scene
 from envedit.solve import adam_loop, search
 from envedit.solve.map_problem import Problem
 from envedit.transport.light_transport import LightTransport
-from tests.oracles.plain import IDENTICAL
+from tests.oracles.builders import exr
+from tests.oracles.plain import IDENTICAL, single
 
 FILM = (8, 6)
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
@@ -76,11 +77,6 @@ def close(got, wanted, relative: float, absolute: float = 0.0) -> None:
     assert error <= relative * np.abs(wanted).max() + absolute, f"off by {error:g}"
 
 
-def single(values):
-    """Copy an array to the device, float32."""
-    return dr.opaque(mi.TensorXf(np.ascontiguousarray(values, np.float32)))
-
-
 @functools.cache
 def matte() -> scene.Scene:
     """Load the shipped scene under a film of a few pixels."""
@@ -113,10 +109,7 @@ def dense(height: int, width: int) -> np.ndarray:
 
 def write_plain(path, values):
     """Write an OpenEXR file past the package."""
-    header = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION}
-    channels = {c: np.ascontiguousarray(values[..., i]) for i, c in enumerate("RGB")}
-    OpenEXR.File(header, channels).write(str(path))
-    return path
+    return exr(path, **{c: np.ascontiguousarray(values[..., i]) for i, c in enumerate("RGB")})
 
 
 def read(m, folder):

@@ -12,11 +12,13 @@ from envedit.scene import scene
 from envedit.solve import adam_loop
 from envedit.targets import painted_image
 from envedit.transport.light_transport import LightTransport
+from tests.oracles.builders import exr
 from tests.oracles.extremes_stages import (
     FILM,
     Outcome,
     close,
     loss_and_gradient,
+    matte,
     plain,
     refused,
     settle,
@@ -39,21 +41,28 @@ def initial():
     return transport(16, 32).apply(single(sky())).numpy()
 
 
-def follow(picture, weight=None):
-    """Edit the logarithms of the map towards a picture; the loss falls, and all stays finite."""
+def traced():
+    """Trace T of the matrix, without columns."""
+    return LightTransport.build(matte(), 16, 32, spp=16, max_depth=3)
+
+
+def edited(picture, weight=None, steps=STEPS, renderer=None, **more):
+    """Edit the logarithms of the map of the matrix towards a picture; returns map and state of the loop."""
     made, before = representations.LogPixels(), sky()
-    objective = adam_loop.Objective(config.Loss(image_l2=1.0), picture, weight, before, STEPS)
-    settings = config.Optimizer(iterations=STEPS, lr=0.02)
-    traced = LightTransport.build(_matte(), 16, 32, spp=16, max_depth=3)
-    params, state = adam_loop.optimise(made, made.encode(before), traced, objective, before, 0, settings)
-    got = made.decode(params).numpy()
+    objective = adam_loop.Objective(config.Loss(image_l2=1.0), picture, weight, before, steps)
+    settings = config.Optimizer(iterations=steps, lr=0.02)
+    params, state = adam_loop.optimise(
+        made, made.encode(before), renderer or traced(), objective, before, 0, settings, **more
+    )
+    return made.decode(params).numpy(), state
+
+
+def follow(picture, weight=None):
+    """Edit the map; the loss falls, and all stays finite."""
+    got, state = edited(picture, weight)
     assert np.isfinite(got).all() and (got >= 0).all() and state.bad_steps == 0
     assert state.history[-1]["loss"] < state.history[0]["loss"]
     return got
-
-
-def _matte():
-    return scene.load("matte", *FILM)
 
 
 def _even(value):
@@ -97,17 +106,11 @@ def _unchecked(value):
     def act(folder):
         picture = initial().copy()
         picture[2, 3] = value
-        made, before = representations.LogPixels(), sky()
-        params = made.encode(before)
+        params = representations.LogPixels().encode(sky())
         start = {name: array.numpy() for name, array in params.items()}
-        traced, held = (
-            LightTransport.build(_matte(), 16, 32, spp=16, max_depth=3),
-            optimizer.Adam(params, 0.02),
-        )
-        objective = adam_loop.Objective(config.Loss(), picture, None, before, 21)
-        settings = config.Optimizer(iterations=21, lr=0.02)  # it stops at the 20th bad step
+        held = optimizer.Adam(params, 0.02)
         try:
-            adam_loop.optimise(made, params, traced, objective, before, 0, settings, adam=held)
+            edited(picture, steps=21, adam=held)  # it stops at the 20th bad step
         finally:
             for name, array in start.items():
                 np.testing.assert_array_equal(held.params[name].numpy(), array)
@@ -120,17 +123,12 @@ def _equal(folder):
 
 
 def _equal_in_the_loop(folder):
-    before = sky()
-    made = representations.LogPixels()
-    traced = LightTransport.build(_matte(), 16, 32, spp=16, max_depth=3)
-    params = made.encode(before)
-    start = made.decode(params).numpy()
-    settle(traced, start)
-    picture = traced.apply(single(start)).numpy()
-    objective = adam_loop.Objective(config.Loss(image_l2=1.0), picture, None, before, STEPS)
-    settings = config.Optimizer(iterations=STEPS, lr=0.02)
-    params, state = adam_loop.optimise(made, params, traced, objective, before, 0, settings)
-    np.testing.assert_array_equal(made.decode(params).numpy(), start)
+    made, renderer = representations.LogPixels(), traced()
+    start = made.decode(made.encode(sky())).numpy()
+    settle(renderer, start)
+    picture = renderer.apply(single(start)).numpy()
+    got, state = edited(picture, renderer=renderer)
+    np.testing.assert_array_equal(got, start)
     assert state.history[-1]["loss"] == 0
     assert metrics.compare(picture, picture) == IDENTICAL
 
@@ -139,15 +137,10 @@ def _transparent(alpha, light=2.0):
     """Paint light times the rendering, with alpha, in an OpenEXR file."""
 
     def act(folder):
-        import OpenEXR
-
-        header = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION}
-        planes = {c: np.ascontiguousarray(alpha * light * initial()[..., i]) for i, c in enumerate("RGB")}
-        planes["A"] = np.full(SHAPE, alpha, np.float32)
-        OpenEXR.File(header, {c: p.astype(np.float32) for c, p in planes.items()}).write(
-            str(folder / "p.exr")
-        )
-        found = painted_image.read(folder / "p.exr", SHAPE, "gamma", initial())
+        paint = (alpha * light * initial()).astype(np.float32)
+        planes = {c: np.ascontiguousarray(paint[..., i]) for i, c in enumerate("RGB")}
+        path = exr(folder / "p.exr", A=np.full(SHAPE, alpha, np.float32), **planes)
+        found = painted_image.read(path, SHAPE, "gamma", initial())
         np.testing.assert_allclose(found.coverage, alpha, rtol=1e-6)
         mixed = (alpha * light + 1 - alpha) * initial().astype(np.float64)
         np.testing.assert_allclose(found.picture, mixed, rtol=1e-5)

@@ -5,6 +5,8 @@ Student needs normal noise, which a pixel that a firefly visits does not have, b
 whole picture have.
 """
 
+from statistics import NormalDist
+
 import numpy as np
 
 LEVEL = 1e-4  # chance of a false alarm in one comparison; some hundred are made in all
@@ -20,13 +22,8 @@ def student(t, freedom: int):
 
 
 def normal_square(p):
-    """Return z^2 of a normal deviate with two-sided tail probability p.
-
-    Abramowitz and Stegun, 26.2.23: |error of z| < 4.5e-4.
-    """
-    s = np.sqrt(-2 * np.log(np.clip(p, 1e-300, 1) / 2))
-    low = 2.515517 + s * (0.802853 + s * 0.010328)
-    return (s - low / (1 + s * (1.432788 + s * (0.189269 + s * 0.001308)))) ** 2
+    """Return z^2 of a normal deviate with two-sided tail probability p."""
+    return np.vectorize(NormalDist().inv_cdf)(np.clip(p, 1e-300, 1) / 2) ** 2
 
 
 def blocks(pictures, size):

@@ -11,6 +11,7 @@ from envedit.scene import scene
 from envedit.solve import feasibility
 from envedit.solve.likelihood import Likelihood, on_average_one
 from envedit.transport.light_transport import LightTransport
+from tests.oracles.dense_transport import DenseTransport
 
 pytestmark = pytest.mark.usefixtures("own_core")
 
@@ -18,28 +19,21 @@ HEIGHT, WIDTH = 4, 8
 PIXELS = (5, 6)
 
 
-class Dense:
-    """T as a matrix (pixels, texels) that all channels share, with the light of other lamps."""
+class Dense(DenseTransport):
+    """One matrix for all channels, with the light of other lamps."""
 
     columns = np.zeros(0, np.int64)
 
     def __init__(self, matrix, shape=PIXELS, grid=(HEIGHT, WIDTH), lamps=0.0, spp=256):
-        self.matrix, self.shape, self.map, self.lamps, self.spp = matrix, shape, (*grid, 3), lamps, spp
+        super().__init__(matrix, shape, grid)
+        self.matrix, self.lamps, self.spp = matrix, lamps, spp
         self.influence = matrix.sum(axis=0).reshape(grid).astype(np.float32)
 
     def linear(self, envmap):
-        light = self.matrix @ envmap.numpy().reshape(-1, 3).astype(np.float64)
-        return mi.TensorXf(light.reshape(*self.shape, 3).astype(np.float32))
+        return super().apply(envmap)
 
     def apply(self, envmap):
         return self.linear(envmap) + self.lamps
-
-    def adjoint(self, picture):
-        light = self.matrix.T @ picture.numpy().reshape(-1, 3).astype(np.float64)
-        return mi.TensorXf(light.reshape(self.map).astype(np.float32))
-
-    def resolve(self, envmap):
-        return 0
 
     def bright_texels(self, envmap):
         return np.zeros(0, np.int64)

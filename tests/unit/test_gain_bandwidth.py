@@ -4,24 +4,17 @@ import numpy as np
 import pytest
 
 from envedit.core import latlong
-from envedit.core.arrays import tensor
 from envedit.representations.layers.gain import grid_size
 from envedit.solve import gain_bandwidth
+from tests.oracles.dense_transport import DenseTransport
 
 WIDTH, ROWS = 64, (0, 32)
 FILM = 24
 BACKGROUND = np.full((16, WIDTH, 3), 0.5)
 
 
-class Dense:
-    """T as a matrix (pixels, texels), the same for all channels."""
-
-    def __init__(self, matrix):
-        self.matrix = matrix
-
-    def adjoint(self, image):
-        pulled = self.matrix.T @ image.numpy().reshape(-1, 3).astype(np.float64)
-        return tensor(pulled.reshape(32, WIDTH, 3))
+def dense(matrix):
+    return DenseTransport(matrix, (FILM, FILM), (32, WIDTH))
 
 
 def mirror(share=1.0):
@@ -29,7 +22,7 @@ def mirror(share=1.0):
     matrix = np.zeros((FILM * FILM, 32 * WIDTH))
     texels = np.arange(16 * WIDTH).reshape(16, WIDTH)[:, : int(share * WIDTH)].ravel()
     matrix[np.arange(FILM * FILM), np.resize(texels, FILM * FILM)] = 1
-    return Dense(matrix)
+    return dense(matrix)
 
 
 def matte():
@@ -37,16 +30,16 @@ def matte():
     d = latlong.directions(32, WIDTH).reshape(-1, 3)
     normal = np.random.default_rng(1).normal(size=(FILM * FILM, 3))
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    return Dense(np.maximum(normal @ d.T, 0) * latlong.solid_angles(32, WIDTH).repeat(WIDTH) / np.pi)
+    return dense(np.maximum(normal @ d.T, 0) * latlong.solid_angles(32, WIDTH).repeat(WIDTH) / np.pi)
 
 
 def sampled(exact, seed, samples=64):
     """What few samples a pixel make of a matrix."""
-    rng, found = np.random.default_rng(seed), np.zeros_like(exact.matrix)
-    for row, weights in zip(found, exact.matrix, strict=True):
+    rng, found = np.random.default_rng(seed), np.zeros_like(exact.weights[0])
+    for row, weights in zip(found, exact.weights[0], strict=True):
         total = weights.sum()
         np.add.at(row, rng.choice(len(weights), samples, p=weights / total), total / samples)
-    return Dense(found)
+    return dense(found)
 
 
 def told(first, second=None, weight=None, value=0.5):
@@ -91,7 +84,7 @@ def test_noise_of_samples_is_not_taken_for_detail():
 
 def test_pixels_that_do_not_count_tell_nothing():
     assert told(mirror(), weight=np.zeros((FILM, FILM, 1))) == []
-    assert told(Dense(np.zeros((FILM * FILM, 32 * WIDTH)))) == []
+    assert told(dense(np.zeros((FILM * FILM, 32 * WIDTH)))) == []
 
 
 @pytest.mark.slow

@@ -11,8 +11,9 @@ from envedit.solve import gauss_newton, search
 from envedit.solve.likelihood import SIGMA, Likelihood, on_average_one
 from envedit.solve.map_problem import Problem
 from envedit.transport.light_transport import LightTransport
+from tests.oracles.maps import angle
 
-pytestmark = pytest.mark.usefixtures("own_core")
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("own_core")]
 
 HEIGHT, WIDTH, ROWS = 32, 64, 16
 PIXELS = 40
@@ -47,8 +48,7 @@ def sky(*suns, flux=3.0):
 
 def blob(place, flux, degrees):
     """Return the sky with a round light."""
-    angle = np.degrees(np.arccos(np.clip(DIRECTIONS @ DIRECTIONS[place], -1, 1)))
-    lobe = np.exp(-0.5 * (angle / degrees) ** 2)
+    lobe = np.exp(-0.5 * (angle(DIRECTIONS, DIRECTIONS[place]) / degrees) ** 2)
     lobe *= flux / (lobe * OMEGA[:, None]).sum()
     return (sky() + lobe[..., None]).astype(np.float32)
 
@@ -86,10 +86,6 @@ def moved(transport):
     return wanted, Found(transport(), sky(SUN), wanted)
 
 
-def degrees_apart(a, b):
-    return np.degrees(np.arccos(np.clip(a @ b, -1, 1)))
-
-
 # ---- a light that moves ----------------------------------------------------------------------------------
 
 PLACES = {
@@ -99,20 +95,18 @@ PLACES = {
 }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("where", PLACES)
 def test_a_sun_is_found_wherever_it_went(where, transport, moved):
     """To a fraction of a texel; it keeps its flux, and there is one."""
     place = PLACES[where]
-    assert degrees_apart(DIRECTIONS[place], DIRECTIONS[SUN]) > NEAR  # staying would not do
+    assert angle(DIRECTIONS[place], DIRECTIONS[SUN]) > NEAR  # staying would not do
     found = moved[1] if place == ELSEWHERE else Found(transport(), sky(SUN), picture(transport(), sky(place)))
     assert found.own == 1 and [*found.lit] == [0]
-    assert degrees_apart(found.lit[0], DIRECTIONS[place]) < 0.5 * TEXEL
+    assert angle(found.lit[0], DIRECTIONS[place]) < 0.5 * TEXEL
     if where != "the horizon":  # of what is there half lies below the rows that may change
         np.testing.assert_allclose(found.flux[0], 1, rtol=0.15)
 
 
-@pytest.mark.slow
 def test_the_map_that_is_found_gives_the_picture(transport, moved):
     """Most of the way: a tenth of the error that there was."""
     wanted, found = moved
@@ -125,7 +119,6 @@ def test_the_map_that_is_found_gives_the_picture(transport, moved):
 # ---- lights that stay, go and come -----------------------------------------------------------------------
 
 
-@pytest.mark.slow
 def test_a_picture_that_is_there_already_changes_nothing(transport):
     image = sky(SUN)
     found = Found(transport(), image, picture(transport(), image))
@@ -133,7 +126,6 @@ def test_a_picture_that_is_there_already_changes_nothing(transport):
     np.testing.assert_allclose(found.decoded, image[:ROWS], rtol=0.02)
 
 
-@pytest.mark.slow
 def test_a_sun_that_the_picture_does_not_show_disappears(transport):
     found = Found(transport(), sky(SUN), picture(transport(), sky()))
     assert not found.lit or found.flux[0].max() < 0.05
@@ -141,7 +133,6 @@ def test_a_sun_that_the_picture_does_not_show_disappears(transport):
     assert found.decoded.max() < 3 * sky()[:ROWS].max() < 0.1 * sky(SUN).max()
 
 
-@pytest.mark.slow
 def test_a_light_that_the_map_does_not_have_is_added(transport):
     """A mirror sees where a light is; a matte ground leaves too much to the sky."""
     place, mirror = (8, 50), transport("mirror")
@@ -149,7 +140,7 @@ def test_a_light_that_the_map_does_not_have_is_added(transport):
     found = Found(mirror, sky(), picture(transport("mirror"), image))
     assert found.own == 0 and found.lit
     for direction in found.lit.values():
-        assert degrees_apart(direction, DIRECTIONS[place]) < NEAR
+        assert angle(direction, DIRECTIONS[place]) < NEAR
     # What was added has the light that was wanted.
     extra = ((found.decoded - sky()[:ROWS]) * OMEGA[:ROWS, None, None]).sum(axis=(0, 1))
     np.testing.assert_allclose(extra, 10, rtol=0.3)
@@ -158,13 +149,11 @@ def test_a_light_that_the_map_does_not_have_is_added(transport):
 # ---- pictures that say little ----------------------------------------------------------------------------
 
 
-@pytest.mark.slow
 def test_a_mask_that_excludes_everything_leaves_the_sky(transport, moved):
     found = Found(transport(), sky(SUN), moved[0], np.zeros((PIXELS, PIXELS, 1), np.float32))
     np.testing.assert_array_equal(found.state["gain"], 0)
 
 
-@pytest.mark.slow
 def test_a_mask_tells_which_pixels_count(transport, moved):
     """What is left out may be anything: it has no say."""
     wanted = moved[0]
@@ -172,16 +161,14 @@ def test_a_mask_tells_which_pixels_count(transport, moved):
     mask[: PIXELS // 4] = 0
     spoilt = np.where(mask > 0, wanted, 0).astype(np.float32)
     found, unmasked = (Found(transport(), sky(SUN), spoilt, weight) for weight in (mask, None))
-    assert degrees_apart(found.lit[0], DIRECTIONS[ELSEWHERE]) < NEAR
+    assert angle(found.lit[0], DIRECTIONS[ELSEWHERE]) < NEAR
     assert unmasked.decoded.mean() < 0.95 * found.decoded.mean()  # without the mask the black pixels count
 
 
-@pytest.mark.slow
 def test_a_black_picture_makes_a_dark_sky(transport):
     found = Found(transport(), sky(SUN), np.zeros((PIXELS, PIXELS, 3), np.float32))
     assert found.decoded.mean() < 0.2 * sky()[:ROWS].mean()
 
 
-@pytest.mark.slow
 def test_a_sun_below_the_rows_that_may_change_is_no_light_to_move(transport):
     assert Found(transport(), sky((20, 7)), picture(transport(), sky())).own == 0

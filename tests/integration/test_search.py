@@ -14,8 +14,9 @@ from envedit.solve.map_problem import Problem
 from envedit.solve.prior import of_paint
 from envedit.targets.pixel_weights import FOLLOWING, pixel_weight
 from envedit.transport.light_transport import LightTransport
+from tests.oracles.maps import angle
 
-pytestmark = pytest.mark.usefixtures("own_core")
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("own_core")]
 
 HEIGHT, WIDTH, ROWS, PIXELS = 32, 64, 16, 48
 SUN = (6, 20)
@@ -68,10 +69,6 @@ def painted(transport, image, other, share=1.0):
     return np.where(coverage > 0, after, before), coverage
 
 
-def degrees(a, b):
-    return np.degrees(np.arccos(np.clip(a @ b, -1, 1)))
-
-
 def found_for(problem, start):
     """Return the likeliest explanation, its lights, and the score of the lights left where they are."""
     as_it_is = Run(start, start)
@@ -90,22 +87,20 @@ def found_for(problem, start):
 # ---- the sun moves -----------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("row", "column"), [(6, 40), (4, 8)])
 def test_a_shadow_that_was_painted_elsewhere_moves_the_sun(row, column, transport):
     """To within 5 degrees, less than a texel; one sun, with the flux that it had."""
     image, place = sky(SUN), (row, column)
     problem, start = problem_of(transport, image, *painted(transport, image, sky(place)))
     found, lights, before, tried = found_for(problem, start)
-    assert [*lights] == [0] and degrees(lights[0], DIRECTIONS[place]) < 5
+    assert [*lights] == [0] and angle(lights[0], DIRECTIONS[place]) < 5
     assert found.name == "light 1 moved" and tried >= 1
     assert found.score < before - search.POSITIVE_EVIDENCE
     assert np.exp(found.run.state["flux"][0]) == pytest.approx(np.ones(3), rel=0.35)
     # The prior is around where it was put.
-    assert degrees(problem.direction(found.run.start, 0), DIRECTIONS[place]) < 8
+    assert angle(problem.direction(found.run.start, 0), DIRECTIONS[place]) < 8
 
 
-@pytest.mark.slow
 def test_the_new_shadow_alone_says_so_too(transport):
     """Of the old one nothing was painted: the rest may follow."""
     image, place = sky(SUN), (6, 40)
@@ -114,13 +109,12 @@ def test_the_new_shadow_alone_says_so_too(transport):
     picture = np.where(darker > 0, after, before)
     problem, start = problem_of(transport, image, picture, darker)
     _, lights, _, _ = found_for(problem, start)
-    assert [*lights] == [0] and degrees(lights[0], DIRECTIONS[place]) < 10
+    assert [*lights] == [0] and angle(lights[0], DIRECTIONS[place]) < 10
 
 
 # ---- a light is added --------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
 def test_a_disc_painted_on_a_mirror_adds_a_light_as_large_as_its_image(tmp_path):
     mirror = scene.load("mirror", PIXELS, PIXELS)
     transport = LightTransport.build(mirror, HEIGHT, WIDTH, max_depth=4, few=True, folder=tmp_path)
@@ -131,7 +125,7 @@ def test_a_disc_painted_on_a_mirror_adds_a_light_as_large_as_its_image(tmp_path)
     problem, start = problem_of(transport, image, picture, coverage)
     found, lights, _, _ = found_for(problem, start)
     added = problem.layers.lights.own
-    assert found.name == "light added" and degrees(lights[added], DIRECTIONS[place]) < 10
+    assert found.name == "light added" and angle(lights[added], DIRECTIONS[place]) < 10
     radius = 0.5 * np.exp(found.run.state["size"][added, 0])
     assert 4 < radius < 20, "a standard deviation"
     left, asked = (
@@ -141,7 +135,6 @@ def test_a_disc_painted_on_a_mirror_adds_a_light_as_large_as_its_image(tmp_path)
     assert left < 0.6 * asked
 
 
-@pytest.mark.slow
 def test_light_painted_beside_light_that_holds_adds_a_light(transport):
     """A tenth of the picture, as a second sun would light it; the first sun's light is painted as it is.
 
@@ -155,20 +148,19 @@ def test_light_painted_beside_light_that_holds_adds_a_light(transport):
     problem, start = problem_of(transport, image, picture, np.maximum(coverage, held.astype(np.float32)))
     found, lights, before, _ = found_for(problem, start)
     assert found.name == "light added" and [*lights] == [0, problem.layers.lights.own]
-    assert degrees(lights[1], DIRECTIONS[place]) < 8 and degrees(lights[0], DIRECTIONS[SUN]) < 8
+    assert angle(lights[1], DIRECTIONS[place]) < 8 and angle(lights[0], DIRECTIONS[SUN]) < 8
     assert found.score < before - search.POSITIVE_EVIDENCE
     off = problem.likelihood.mean(found.point.residual) * VISIBLE
     assert np.abs(off).max() < 2 * VISIBLE
 
 
-@pytest.mark.slow
 def test_a_sun_that_is_painted_under_a_sky_without_one_is_added_although_it_lights_the_rest(transport):
     place, image = (8, 44), sky()
     lit = painted(transport, image, sky(place, flux=1.0), share=0.05)
     problem, start = problem_of(transport, image, *lit)
     found, lights, _, _ = found_for(problem, start)
     assert found.name == "light added" and [*lights] == [0]
-    assert degrees(lights[0], DIRECTIONS[place]) < 5
+    assert angle(lights[0], DIRECTIONS[place]) < 5
     off = problem.likelihood.mean(found.point.residual) * VISIBLE
     assert off.max() > VISIBLE
 
@@ -176,7 +168,6 @@ def test_a_sun_that_is_painted_under_a_sky_without_one_is_added_although_it_ligh
 # ---- lights stay -------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
 def test_of_paint_that_no_light_makes_other_answers_are_shown(transport, rng):
     """Stripes as bright as noon, and as dark as night: no move promises anything."""
     image = sky(SUN)
@@ -188,7 +179,6 @@ def test_of_paint_that_no_light_makes_other_answers_are_shown(transport, rng):
     assert found.others and tried >= len(found.others)
 
 
-@pytest.mark.slow
 def test_paint_that_is_there_already_leaves_lights(transport):
     """No move is promising: nothing else is descended to."""
     image = sky(SUN)
@@ -198,11 +188,10 @@ def test_paint_that_is_there_already_leaves_lights(transport):
     problem, start = problem_of(transport, image, before, coverage)
     found, lights, _, tried = found_for(problem, start)
     assert found.name == "lights left where they are" and tried == 0
-    assert [*lights] == [0] and degrees(lights[0], DIRECTIONS[SUN]) < 0.5
+    assert [*lights] == [0] and angle(lights[0], DIRECTIONS[SUN]) < 0.5
     assert np.abs(found.run.state["gain"]).max() < 0.02
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("factor", [0.6, 1.4])
 def test_paint_that_one_factor_makes_leaves_lights(factor, transport):
     image = sky(SUN)
@@ -210,12 +199,11 @@ def test_paint_that_one_factor_makes_leaves_lights(factor, transport):
     coverage = np.ones((PIXELS, PIXELS, 1), np.float32)
     problem, start = problem_of(transport, image, np.float32(factor * before), coverage)
     found, lights, _, _ = found_for(problem, start)
-    assert [*lights] == [0] and degrees(lights[0], DIRECTIONS[SUN]) < 3
+    assert [*lights] == [0] and angle(lights[0], DIRECTIONS[SUN]) < 3
     shown = found.point.rendering.mean() / before.mean()
     assert shown == pytest.approx(factor, rel=0.1)
 
 
-@pytest.mark.slow
 def test_what_is_raised_after_a_step_ends_the_search(transport):
     image = sky(SUN)
     problem, start = problem_of(transport, image, *painted(transport, image, sky((6, 40))))
@@ -227,7 +215,6 @@ def test_what_is_raised_after_a_step_ends_the_search(transport):
         search.search(problem, start, after_step=enough)
 
 
-@pytest.mark.slow
 def test_a_map_that_is_not_finite_has_no_explanation(transport):
     """The search returns it as it is; the steps refuse it."""
     image = sky(SUN)
@@ -237,7 +224,6 @@ def test_a_map_that_is_not_finite_has_no_explanation(transport):
     assert found.point.residual is None and found.score == np.inf
 
 
-@pytest.mark.slow
 def test_the_same_paint_has_the_same_explanation_to_the_bit(traced):
     image = sky(SUN)
     ends = []

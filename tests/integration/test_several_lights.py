@@ -5,16 +5,13 @@ import pytest
 
 import envedit
 from envedit.core import latlong
+from tests.oracles.maps import angle, toward
 
 pytestmark = pytest.mark.usefixtures("own_core")
 
 HEIGHT, WIDTH = 64, 128
-LAMPS = {"ceiling": (200, 55), "desk": (165, 8), "corner": (320, 25)}
-
-
-def direction(azimuth, elevation):
-    a, e = np.radians(azimuth), np.radians(elevation)
-    return np.array([np.cos(e) * np.sin(a), np.sin(e), -np.cos(e) * np.cos(a)])
+LAMPS = {"ceiling": (55, 200), "desk": (8, 165), "corner": (25, 320)}
+"""Name -> elevation and azimuth in degrees."""
 
 
 def room(lamps):
@@ -22,7 +19,7 @@ def room(lamps):
     d = latlong.directions(HEIGHT, WIDTH)
     envmap = np.repeat(0.15 + 0.05 * d[..., 1:2], 3, axis=2)
     for place in lamps.values():
-        envmap[d @ direction(*place) > np.cos(np.radians(4))] = [200, 160, 110]
+        envmap[angle(d, toward(*place)) < 4] = [200, 160, 110]
     return envmap.astype(np.float32)
 
 
@@ -30,7 +27,7 @@ def room(lamps):
     ("lamps", "removed", "added"),
     [
         ({name: place for name, place in LAMPS.items() if name != "corner"}, 1, 0),
-        (LAMPS | {"new": (20, 40)}, 0, 1),
+        (LAMPS | {"new": (40, 20)}, 0, 1),
     ],
     ids=["off", "added"],
 )
@@ -50,6 +47,6 @@ def test_only_the_lamp_that_has_changed_changes(lamps, removed, added):
     assert len(stayed) == len(LAMPS) - removed
     assert sum(light["removed"] for light in found["before"]) == removed
     assert sum(light["added"] for light in found["after"]) == added
-    toward = [direction(light["azimuth"], light["elevation"]) for light in after.values()]
+    found = [toward(light["elevation"], light["azimuth"]) for light in after.values()]
     for place in [lamps["new"]] if added else []:
-        assert max(one @ direction(*place) for one in toward) > np.cos(np.radians(3))
+        assert min(angle(one, toward(*place)) for one in found) < 3

@@ -17,6 +17,7 @@ from envedit.images import images
 from envedit.representations.layers import aureoles, layers, lights
 from envedit.representations.layers.lights import DARK, LOBE_DEGREES, SPARE, Lights
 from envedit.representations.layers.separation import GLOW_DEGREES, Light, glow_at
+from tests.oracles import maps
 from tests.oracles.plain import single
 
 H, W = 25, 48
@@ -73,11 +74,6 @@ def place(made, turn=0.0, flux=0.0, size=0.0):
 
 def core(made, *at, shape=(H, W), rows=None, **where):
     return made.core(*(at or place(made, **where)), shape, rows or (0, shape[0])).numpy()
-
-
-def flux_of(image):
-    omega = latlong.lookup_solid_angles(*image.shape[:2])
-    return (np.float64(image) * omega[:, None, None]).sum(axis=(0, 1))
 
 
 def second_moments(image, centre):
@@ -233,21 +229,21 @@ GOALS = [(math.pi / 2, 0.0), (-math.pi / 2, 0.0), (1.5, 2.0), (-1.5, -2.0), (0.0
 def test_flux_is_kept_anywhere_on_the_sphere(top, rng):
     """Low to high and back, across the seam, over a pole, at a pole."""
     light = patch(rng, top, 46)
-    made, expected = Lights([light], (0, H), W), flux_of(image_of(light))
+    made, expected = Lights([light], (0, H), W), maps.flux(image_of(light))
     np.testing.assert_allclose(made.flux[0], expected, rtol=1e-6)
     turns = [centred_at(light, *goal) for goal in GOALS] + [random_turn(rng) for _ in range(30)]
     for turn in turns:
         got = core(made, turn=turn)
         assert np.isfinite(got).all() and (got >= 0).all()
-        np.testing.assert_allclose(flux_of(got), expected, rtol=1e-5)
+        np.testing.assert_allclose(maps.flux(got), expected, rtol=1e-5)
 
 
 @pytest.mark.parametrize("size", [-3.0, -0.7, 0.4, 1.2])
 def test_size_keeps_the_flux(size, rng):
     light = patch(rng, 10, 10)
-    made, expected = Lights([light], (0, H), W), flux_of(image_of(light))
+    made, expected = Lights([light], (0, H), W), maps.flux(image_of(light))
     got = core(made, size=size)
-    np.testing.assert_allclose(flux_of(got), expected, rtol=1e-5)
+    np.testing.assert_allclose(maps.flux(got), expected, rtol=1e-5)
     lit, before = np.count_nonzero(got), np.count_nonzero(image_of(light))
     assert lit > before if size > 0 else lit <= before
 
@@ -276,7 +272,7 @@ def test_a_spare_light_can_have_a_colour_that_no_light_has(rng):
     assert (made.flux[0] > 0).tolist() == [True, False, False]
     turn, flux, size = (np.array(p) for p in place(made, flux=DARK))
     flux[1] = np.log(made.flux[1, 0] / made.flux[1])
-    got = flux_of(core(made, single(turn), single(flux), single(size), shape=(64, 128)))
+    got = maps.flux(core(made, single(turn), single(flux), single(size), shape=(64, 128)))
     np.testing.assert_allclose(got, made.flux[0, 0], rtol=1e-4)
 
 
@@ -284,7 +280,7 @@ def test_spare_lights_are_lobes_with_the_mean_flux(rng):
     both = [patch(rng, 4, 10), patch(rng, 15, 40)]
     for own in (both, both[:1], []):
         made = Lights(own, (0, H), W)
-        fluxes = [flux_of(image_of(light)) for light in own] or [np.ones(3)]
+        fluxes = [maps.flux(image_of(light)) for light in own] or [np.ones(3)]
         turn, flux, size = (np.array(p) for p in place(made, flux=DARK))
         assert made.count == len(own) + SPARE
         for i in range(SPARE):
@@ -294,7 +290,7 @@ def test_spare_lights_are_lobes_with_the_mean_flux(rng):
                 goal = unit(rng)
                 turn[len(own) + i] = rotation_vector(UP, goal)
                 got = core(made, single(turn), single(flux), single(size), shape=(64, 128))
-                np.testing.assert_allclose(flux_of(got), np.mean(fluxes, axis=0), rtol=1e-5)
+                np.testing.assert_allclose(maps.flux(got), np.mean(fluxes, axis=0), rtol=1e-5)
                 d, omega = latlong.directions(64, 128), latlong.lookup_solid_angles(64, 128)[:, None]
                 share = got[..., 0] * omega / (got[..., 0] * omega).sum()
                 near = np.degrees(np.arccos(np.clip(d @ goal, -1, 1))) < 4 * LOBE_DEGREES + 2 * 180 / 64
@@ -318,7 +314,7 @@ def test_spare_lights_are_round(width, degrees, rng):
         goal = np.array([np.cos(tilt) * np.sin(azimuth), np.sin(tilt), -np.cos(tilt) * np.cos(azimuth)])
         turn[0] = rotation_vector(UP, goal)
         got = core(made, single(turn), single(flux), single(size), shape=shape)
-        np.testing.assert_allclose(flux_of(got), made.flux[0], rtol=1e-5)
+        np.testing.assert_allclose(maps.flux(got), made.flux[0], rtol=1e-5)
         moments = second_moments(got, goal)
         np.testing.assert_allclose(moments, moments.mean(), rtol=0.05)
         # Tents are wider where texels are finer than points lie apart.
@@ -611,4 +607,6 @@ def test_core_of_any_exposure(peak, rng):
     made, expected = Lights([light], (0, H), W), image_of(light)
     np.testing.assert_allclose(core(made), expected, atol=1e-6 * peak)
     for _ in range(5):
-        np.testing.assert_allclose(flux_of(core(made, turn=random_turn(rng))), flux_of(expected), rtol=1e-5)
+        np.testing.assert_allclose(
+            maps.flux(core(made, turn=random_turn(rng))), maps.flux(expected), rtol=1e-5
+        )

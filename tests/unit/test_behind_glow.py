@@ -11,10 +11,11 @@ from envedit.losses import metrics
 from envedit.representations.layers.behind_glow import behind_glow
 from envedit.representations.layers.layers import SCALES, Layers
 from envedit.representations.layers.lights import DARK
+from tests.oracles.maps import angle
 from tests.unit.test_layers import SHAPE, SUN, sent, sky
 
 D = latlong.directions(*SHAPE)
-AWAY = np.degrees(np.arccos(np.clip(D @ D[SUN], -1, 1)))
+AWAY = angle(D, D[SUN])
 ROWS = 0, SHAPE[0]
 
 
@@ -69,7 +70,7 @@ def test_the_old_place_of_a_sun_looks_like_the_elevation_and_an_unmoved_one_keep
     plain = sky(sun=None)
     image = plain * np.float32(1 + 30 * np.exp(-AWAY / 10))[..., None]
     image[SUN] = 5e4
-    mirror = np.degrees(np.arccos(np.clip(D @ (D[SUN] * [1, -1, 1]), -1, 1)))
+    mirror = angle(D, D[SUN] * [1, -1, 1])
     image[32:] = (plain * np.float32(1 + 4 * np.exp(-0.5 * (mirror / 6) ** 2))[..., None])[32:]
     made = Layers.of(image, horizon="mirror")
     params = made.start()
@@ -87,10 +88,10 @@ def test_a_low_orange_sun_that_leaves_a_grey_sky_leaves_no_fleck_below_the_horiz
     """Its reflection goes with its glow, and its colour before the sky's saturation is lowered."""
     low, orange = (29, 20), np.float32([1.0, 0.4, 0.1])
     plain, at = sky(sun=None), D[low]
-    away = np.degrees(np.arccos(np.clip(D @ at, -1, 1)))
+    away = angle(D, at)
     image = plain * (1 + 8 * np.float32(np.exp(-away / 8))[..., None] * orange)
     image[low] = 5e3 * orange
-    mirror = np.degrees(np.arccos(np.clip(D @ (at * [1, -1, 1]), -1, 1)))
+    mirror = angle(D, at * [1, -1, 1])
     shine = 1 + 20 * np.float32(np.exp(-0.5 * (mirror / 3) ** 2))[..., None] * orange
     image[32:] = (plain * (1 + 8 * np.float32(np.exp(-mirror / 8))[..., None] * orange) * shine)[32:]
     made = Layers.of(image, horizon="mirror")
@@ -122,10 +123,10 @@ def test_a_sun_that_rises_or_sets_is_in_its_place_and_tears_nothing(elevation, a
     edited = made.decode(sent(made, params, end)).numpy()
     # Near the zenith a texel is less than 2.8 degrees wide: the distance is an angle.
     where = [latlong.directions(64, 128)[metrics.peak_position(m)] for m in (edited, true)]
-    assert np.degrees(np.arccos(np.clip(where[0] @ where[1], -1, 1))) < 1.5 * 180 / 63
+    assert angle(*where) < 1.5 * 180 / 63
     assert metrics.psnr(tonemap(edited), tonemap(true)) > metrics.psnr(tonemap(original), tonemap(true))
     logs = [np.log(m[:28] @ LUMINANCE + 1e-3) for m in (edited, true)]
-    away = np.degrees(np.arccos(np.clip(latlong.directions(64, 128)[:28] @ end, -1, 1))) > 12
+    away = angle(latlong.directions(64, 128)[:28], end) > 12
     for apart in (lambda a: np.diff(a, axis=0), lambda a: (a - np.roll(a, 1, axis=1))[1:]):
         steps = [np.abs(apart(one))[away[1:] & away[:-1]].max() for one in logs]
         assert steps[0] < 1.6 * steps[1] + 0.02
@@ -135,7 +136,7 @@ def test_a_sun_that_rises_or_sets_is_in_its_place_and_tears_nothing(elevation, a
 def test_a_glow_adds_to_a_cloud_what_it_adds_to_the_sky():
     """It is haze before the cloud; a dark outline is brightened in proportion, and stays dark."""
     new = D[SUN] * [-1, 1, -1]
-    away = np.degrees(np.arccos(np.clip(D @ new, -1, 1)))
+    away = angle(D, new)
     column = np.degrees(np.arctan2(D[..., 0], -D[..., 2])) - np.degrees(np.arctan2(new[0], -new[2]))
     column = (column + 180) % 360 - 180
     plain = sky(sun=None)

@@ -15,6 +15,7 @@ from envedit.representations.layers.layers import Layers
 from envedit.representations.layers.lights import DARK, LOBE_DEGREES
 from tests.oracles.builders import grey
 from tests.oracles.devices import on_cpu
+from tests.oracles.maps import angle, flux, toward
 from tests.oracles.plain import lookup
 
 WORKING, ROWS = (64, 128), (0, 32)
@@ -32,22 +33,8 @@ def sky(height, width, sun=(25.0, 200.0), radius=1.0, peak=2e4, glow=True, seed=
     return m.astype(np.float32)
 
 
-def toward(elevation, azimuth):
-    e, a = np.radians([elevation, azimuth])
-    return np.array([np.cos(e) * np.sin(a), np.sin(e), -np.cos(e) * np.cos(a)])
-
-
-def angle(d, v):
-    return np.degrees(np.arccos(np.clip(d @ v, -1, 1)))
-
-
 def near(shape, v, degrees):
     return angle(latlong.directions(*shape), v) < degrees
-
-
-def flux(m, where=None):
-    omega = latlong.lookup_solid_angles(*m.shape[:2])[:, None, None]
-    return (np.float64(m) * omega * (1 if where is None else where[..., None])).sum(axis=(0, 1))
 
 
 def small(source, size=WORKING):

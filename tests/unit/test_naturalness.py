@@ -5,6 +5,7 @@ import pytest
 
 from envedit.core import latlong
 from envedit.losses import naturalness
+from tests.oracles.maps import angle
 
 GRID = (64, 128)
 DIRECTIONS = latlong.directions(*GRID)
@@ -18,14 +19,14 @@ def grey(log, level=30.0):
 
 
 def degrees_from(place):
-    return np.degrees(np.arccos(np.clip(DIRECTIONS @ DIRECTIONS[place], -1, 1)))
+    return angle(DIRECTIONS, DIRECTIONS[place])
 
 
 def by_texels(log):
     """The measure over all texels in place of cells, as an integral over the upper half."""
     d, omega, g = DIRECTIONS[:HALF].reshape(-1, 3), OMEGA.ravel(), log[:HALF].ravel()
     some = slice(None, None, 3)
-    kernel = np.exp(-0.5 * (np.degrees(np.arccos(np.clip(d[some] @ d.T, -1, 1))) / 60) ** 2) * omega
+    kernel = np.exp(-0.5 * (angle(d[some], d.T) / 60) ** 2) * omega
     off = g[some] - kernel @ g / kernel.sum(axis=1)
     return np.sqrt((omega[some] * off**2).sum() / omega[some].sum())
 

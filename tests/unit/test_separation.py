@@ -9,6 +9,7 @@ from envedit.core import latlong
 from envedit.core.color import LUMINANCE
 from envedit.images import images
 from envedit.representations.layers import separation
+from tests.oracles.maps import angle, toward
 
 HEIGHT, WIDTH = 64, 128
 SUNS = {
@@ -19,16 +20,6 @@ SUNS = {
     "near the pole": (1, 30),
     "near the lower pole": (HEIGHT - 2, 7),
 }
-
-
-def toward(elevation, azimuth):
-    e, a = np.radians([elevation, azimuth])
-    return np.array([np.cos(e) * np.sin(a), np.sin(e), -np.cos(e) * np.cos(a)])
-
-
-def angle(d, v):
-    """Degrees between directions."""
-    return np.degrees(np.arccos(np.clip(d @ v, -1, 1)))
 
 
 def sky(height=HEIGHT, width=WIDTH, slope=0.3):

@@ -61,15 +61,16 @@ def turned(orientation):
     return b"MM\0*" + struct.pack(">IH", 8, 1) + entry + bytes(4)
 
 
-# ---- losses ------------------------------------------------------------------------------------------------
-
-
 # ---- scenes ------------------------------------------------------------------------------------------------
 
 SENSOR = """<sensor type="perspective"><float name="fov" value="40"/>
     <transform name="to_world"><lookat origin="0,1,6" target="0,0,0" up="0,1,0"/></transform>
     <film type="hdrfilm"><integer name="width" value="16"/><integer name="height" value="12"/>
     <rfilter type="box"/></film></sensor>"""
+ORIGIN, HALF = np.array([0.0, 1.0, 6.0]), np.tan(np.radians(20))
+AHEAD = -ORIGIN / np.linalg.norm(ORIGIN)
+RIGHT, UP = np.array([1.0, 0.0, 0.0]), np.array([0.0, -AHEAD[2], AHEAD[1]])
+"""Where the camera of SENSOR is and looks, and half of its picture's width at a distance of 1."""
 BALL = """<shape type="sphere"><bsdf type="diffuse">
     <rgb name="reflectance" value="0.2, 0.4, 0.6"/></bsdf></shape>"""
 LIGHT = '<emitter type="constant"/>'

@@ -7,8 +7,9 @@ from envedit.representations.layers import placed_lights
 from envedit.representations.layers.placed_lights import angles
 from envedit.scene import highlight, scene
 from envedit.scene.camera_paths import NoPlaceError
-from tests.oracles.builders import BALL, LIGHT, SENSOR, write_scene
+from tests.oracles.builders import AHEAD, BALL, HALF, LIGHT, ORIGIN, RIGHT, SENSOR, UP, write_scene
 from tests.oracles.tiers import slow_but
+from tests.unit.test_shadow import FLOOR
 
 GLOSSY = {
     "rough": '<bsdf type="roughconductor"><float name="alpha" value="0.2"/></bsdf>',
@@ -26,15 +27,10 @@ def ball(folder, bsdf, *more):
 
 def mirrored(x, y):
     """Return the reflected direction of the camera of SENSOR on the unit sphere, (3,)."""
-    origin = np.array([0.0, 1.0, 6.0])
-    ahead = -origin / np.linalg.norm(origin)
-    right = np.cross(ahead, [0.0, 1.0, 0.0])
-    right /= np.linalg.norm(right)
-    half = np.tan(np.radians(20))
-    ray = ahead + right * half * (2 * x - 1) + np.cross(right, ahead) * half * 12 / 16 * (1 - 2 * y)
+    ray = AHEAD + RIGHT * HALF * (2 * x - 1) + UP * HALF * 12 / 16 * (1 - 2 * y)
     ray /= np.linalg.norm(ray)
-    along = origin @ ray
-    normal = origin + ray * (-along - np.sqrt(along**2 - origin @ origin + 1))
+    along = ORIGIN @ ray
+    normal = ORIGIN + ray * (-along - np.sqrt(along**2 - ORIGIN @ ORIGIN + 1))
     return ray - 2 * (ray @ normal) * normal
 
 
@@ -64,9 +60,7 @@ def test_where_no_light_can_do_it_the_reason_is_told(tmp_path):
     lit = scene.load(write_scene(tmp_path / "a", SENSOR, LIGHT, BALL), width=32)
     with pytest.raises(NoPlaceError, match="not glossy"):
         highlight.direction(lit, 0, 0.5, 0.5)
-    floor = '<shape type="rectangle"><transform name="to_world"><scale value="50"/>'
-    floor += '<rotate x="1" angle="-90"/><translate y="-1"/></transform></shape>'
-    lit = ball(tmp_path / "b", GLOSSY["rough"], floor)
+    lit = ball(tmp_path / "b", GLOSSY["rough"], FLOOR)
     with pytest.raises(NoPlaceError, match="another object is reflected"):
         highlight.direction(lit, 0, 0.5, 0.62)
     highlight.direction(lit, 0, 0.5, 0.45)

@@ -7,13 +7,13 @@ from envedit.images import images
 from envedit.representations.layers.placed_lights import direction
 from envedit.scene import placement, scene, shadow
 from envedit.scene.camera_paths import NoPlaceError
-from tests.oracles.builders import LIGHT, SENSOR, write_scene
-from tests.unit.test_shadow import FLOOR, ORIGIN, SMALL_BALL, on_picture
+from tests.oracles.builders import AHEAD, LIGHT, RIGHT, SENSOR, UP, write_scene
+from tests.unit.test_shadow import FLOOR, SMALL_BALL, on_picture
 
 TURNED = LIGHT.replace(
     "</emitter>", '<transform name="to_world"><rotate y="1" angle="70"/></transform></emitter>'
 )
-EYE = ORIGIN / np.linalg.norm(ORIGIN)
+EYE = -AHEAD
 FLOOR_POINT = np.array([0.9, -1.0, 0.5])
 
 
@@ -25,10 +25,7 @@ def lit(request, tmp_path):
 
 def on_ball(degrees, bearing=0.0):
     """Return a point of the ball at an angle from the camera's axis, to the right or by a bearing upwards."""
-    right = np.cross(-EYE, [0.0, 1.0, 0.0])
-    right /= np.linalg.norm(right)
-    up = np.cross(right, -EYE)
-    aside = np.cos(np.radians(bearing)) * right + np.sin(np.radians(bearing)) * up
+    aside = np.cos(np.radians(bearing)) * RIGHT + np.sin(np.radians(bearing)) * UP
     return 0.5 * (np.cos(np.radians(degrees)) * EYE + np.sin(np.radians(degrees)) * aside)
 
 

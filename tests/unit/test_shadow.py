@@ -7,7 +7,7 @@ from envedit.representations.layers import placed_lights
 from envedit.representations.layers.placed_lights import angles, direction
 from envedit.scene import scene, shadow
 from envedit.scene.camera_paths import NoPlaceError
-from tests.oracles.builders import BALL, LIGHT, SENSOR, write_scene
+from tests.oracles.builders import AHEAD, BALL, HALF, LIGHT, ORIGIN, RIGHT, SENSOR, UP, write_scene
 
 FLOOR = (
     '<shape type="rectangle"><transform name="to_world"><scale value="50"/>'
@@ -18,7 +18,6 @@ PIERCED = (
     '<shape type="sphere"><float name="radius" value="0.7"/>'
     '<bsdf type="mask"><float name="opacity" value="0.2"/><bsdf type="diffuse"/></bsdf></shape>'
 )
-ORIGIN = np.array([0.0, 1.0, 6.0])
 
 
 @pytest.fixture
@@ -28,12 +27,9 @@ def lit(tmp_path):
 
 def on_picture(point):
     """Return the place (x, y) at which the camera of SENSOR sees a point."""
-    ahead = -ORIGIN / np.linalg.norm(ORIGIN)
-    right = np.cross(ahead, [0.0, 1.0, 0.0])
-    right /= np.linalg.norm(right)
     toward = point - ORIGIN
-    half = np.tan(np.radians(20)) * (toward @ ahead)
-    return (toward @ right) / half / 2 + 0.5, 0.5 - (toward @ np.cross(right, ahead)) / half * 16 / 12 / 2
+    half = HALF * (toward @ AHEAD)
+    return (toward @ RIGHT) / half / 2 + 0.5, 0.5 - (toward @ UP) / half * 16 / 12 / 2
 
 
 def test_the_occluder_is_found_and_the_light_follows_the_pointer(lit):

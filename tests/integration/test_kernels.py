@@ -3,14 +3,14 @@
 import resource
 from pathlib import Path
 
-import drjit as dr
 import pytest
 
 from envedit import config, pipeline
 from envedit.solve import adam_loop, gauss_newton, layers_solver, map_problem
 from envedit.transport.light_transport import LightTransport
+from tests.oracles.kernels import compiled, history
 
-pytestmark = pytest.mark.usefixtures("own_core")
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("own_core")]
 
 SMALL = [
     "input.width=64",
@@ -27,7 +27,6 @@ SMALL = [
 ADAM = ["optimizer.kind=adam", "representation.turn=false"]  # a turned map would be the result without a step
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["siren", "pixels"])
 def test_no_kernel_is_compiled_after_the_third_iteration(kind, monkeypatch):
     # The analytic sun moves by 60 degrees: columns of T are traced and replaced in iterations 10 to 40.
@@ -36,10 +35,8 @@ def test_no_kernel_is_compiled_after_the_third_iteration(kind, monkeypatch):
     compare, render = adam_loop.Objective.__call__, LightTransport.render
 
     def counted(objective, rendering, crop, step):
-        kernels = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
-        launched.append(len(kernels))
-        # Compiled, or fetched from the disk: not in memory yet.
-        fresh[step] = sum(not k["cache_hit"] or k["cache_disk"] for k in kernels)
+        number, fresh[step] = history()
+        launched.append(number)
         return compare(objective, rendering, crop, step)
 
     def watched(transport, envmap, step):
@@ -48,23 +45,19 @@ def test_no_kernel_is_compiled_after_the_third_iteration(kind, monkeypatch):
 
     monkeypatch.setattr(adam_loop.Objective, "__call__", counted)
     monkeypatch.setattr(LightTransport, "render", watched)
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        dr.kernel_history_clear()
-        pipeline.run(settings)
+    compiled(lambda: pipeline.run(settings))
     assert len(fresh) == 45 and min(launched) > 10  # the history was kept
     assert {step: count for step, count in fresh.items() if step >= 3 and count} == {}
     assert columns[-1] > columns[1]  # else nothing was traced after the first step, and nothing shown
 
 
-@pytest.mark.slow
 def test_no_kernel_is_compiled_after_the_third_gauss_newton_step(monkeypatch):
     settings = config.loads("", overrides=[*SMALL, "target.rotate_degrees=100", "representation.turn=false"])
     fresh, launched, columns, normal = [], [], [], map_problem.Problem.normal
 
     def counted(problem, *arguments, **options):
-        kernels = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
-        launched.append(len(kernels))
-        fresh.append(sum(not k["cache_hit"] or k["cache_disk"] for k in kernels))
+        for kept, number in zip((launched, fresh), history(), strict=True):
+            kept.append(number)
         columns.append(len(problem.transport.columns))
         if len(fresh) == 5:  # a texel that becomes bright gets a column
             bright = problem.envmap.copy()
@@ -77,27 +70,17 @@ def test_no_kernel_is_compiled_after_the_third_gauss_newton_step(monkeypatch):
     # What is between solves, the search and T's error, has kernels of its own.
     monkeypatch.setattr(layers_solver.LayersSolver, "_another", lambda *_: None)
     monkeypatch.setattr(layers_solver.LayersSolver, "_corrected", lambda *_: None)
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        dr.kernel_history_clear()
-        result = pipeline.run(settings)
-    assert len(fresh) > 5 and len(result.history) > 2 and min(launched) > 5
+    steps = []
+    compiled(lambda: steps.extend(pipeline.run(settings).history))
+    assert len(fresh) > 5 and len(steps) > 2 and min(launched) > 5
     assert fresh[3:] == [0] * len(fresh[3:])
     assert columns[-1] > columns[3]
 
 
-@pytest.mark.slow
 def test_memory_does_not_grow_over_200_iterations(monkeypatch):
-    settings = config.loads(
-        "",
-        overrides=[
-            *SMALL,
-            "representation.kind=siren",
-            "representation.hidden=16",
-            "representation.turn=false",
-            "target.spp=256",
-            "optimizer.iterations=200",
-        ],
-    )
+    more = ["representation.kind=siren", "representation.hidden=16", "representation.turn=false"]
+    more += ["target.spp=256", "optimizer.iterations=200"]
+    settings = config.loads("", overrides=[*SMALL, *more])
     live, compare = {}, adam_loop.Objective.__call__
 
     def watched(objective, rendering, crop, step):

@@ -18,10 +18,18 @@ def own(array):
     return dr.opaque(mi.TensorXf(np.asarray(array, np.float32)))
 
 
+def history():
+    """Count the kernels since it was last called, and those that were not in memory yet.
+
+    The latter are compiled, or fetched from the disk.
+    """
+    kernels = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
+    return len(kernels), sum(not k["cache_hit"] or k["cache_disk"] for k in kernels)
+
+
 def compiled(call):
-    """Count the kernels that were not in memory yet: compiled, or fetched from the disk."""
+    """Do some work and return what :func:`history` counts of it."""
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
         call()
-        kernels = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
-    return len(kernels), sum(not k["cache_hit"] or k["cache_disk"] for k in kernels)
+        return history()

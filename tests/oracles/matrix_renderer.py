@@ -60,5 +60,14 @@ def same(a, b):
     return a.keys() == b.keys() and all(np.array_equal(a[name], b[name]) for name in a)
 
 
+def same_bits(a, b):
+    """Compare arrays by name: their types, shapes and bytes."""
+    one, other = (
+        {name: (np.asarray(v).dtype, np.shape(v), np.asarray(v).tobytes()) for name, v in found.items()}
+        for found in (a, b)
+    )
+    return one == other
+
+
 def without_times(history):
     return [{key: value for key, value in row.items() if key != "step_ms"} for row in history]

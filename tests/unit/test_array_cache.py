@@ -10,6 +10,7 @@ import pytest
 
 from envedit.core import array_cache
 from envedit.core.array_cache import DiskCache
+from tests.oracles.matrix_renderer import same_bits
 
 KEY = {"scene": "abc", "seed": 3, "grid": [8, 16]}
 
@@ -26,12 +27,6 @@ def some(rng, size=3000):
     }
 
 
-def same(a, b):
-    return a.keys() == b.keys() and all(
-        a[k].dtype == b[k].dtype and a[k].shape == b[k].shape and a[k].tobytes() == b[k].tobytes() for k in a
-    )
-
-
 def only_file(folder):
     (path,) = folder.iterdir()
     return path
@@ -41,8 +36,8 @@ def test_the_same_bits_come_back(tmp_path, rng):
     cache, arrays = DiskCache(tmp_path / "a" / "b"), some(rng)
     assert cache.load(KEY) is None
     cache.store(KEY, arrays)
-    assert same(cache.load(KEY), arrays)
-    assert same(DiskCache(tmp_path / "a" / "b").load(dict(reversed(KEY.items()))), arrays)
+    assert same_bits(cache.load(KEY), arrays)
+    assert same_bits(DiskCache(tmp_path / "a" / "b").load(dict(reversed(KEY.items()))), arrays)
 
 
 def test_arrays_of_any_layout_are_kept(tmp_path, rng):
@@ -57,7 +52,7 @@ def test_another_key_finds_nothing_and_a_new_entry_takes_the_place_of_the_old(tm
     assert cache.load(KEY | {"seed": 4}) is None and cache.load({}) is None
     newer = some(rng, 10)
     cache.store(KEY, newer)
-    assert same(cache.load(KEY), newer) and len(list(tmp_path.iterdir())) == 1
+    assert same_bits(cache.load(KEY), newer) and len(list(tmp_path.iterdir())) == 1
 
 
 # ---- files that are no good ------------------------------------------------------------------------------
@@ -75,7 +70,7 @@ def test_no_damage_to_a_single_byte_goes_unseen(tmp_path, rng):
         damaged[place] ^= 1 << place % 8
         path.write_bytes(damaged)
         found = cache.load(KEY)
-        assert found is None or same(found, arrays)
+        assert found is None or same_bits(found, arrays)
         seen += found is None
     used = sum(array.nbytes for array in arrays.values())
     assert seen > used + 200  # all of the arrays and the description
@@ -139,7 +134,7 @@ def test_a_full_disk_leaves_what_was_there(tmp_path, rng, monkeypatch):
         patch.setattr(array_cache.os, "replace", full)
         cache.store(KEY, some(rng, 10))
         cache.store({}, some(rng, 10))
-    assert same(cache.load(KEY), arrays) and len(list(tmp_path.iterdir())) == 1
+    assert same_bits(cache.load(KEY), arrays) and len(list(tmp_path.iterdir())) == 1
 
 
 # ---- the bound -------------------------------------------------------------------------------------------
@@ -229,7 +224,7 @@ def test_exchanged_words_pages_and_bits_are_seen(part, tmp_path, rng, monkeypatc
     cache.store(KEY, arrays)
     path = only_file(tmp_path)
     good = path.read_bytes()
-    assert same(cache.load(KEY), arrays)
+    assert same_bits(cache.load(KEY), arrays)
     start = len(good) - 320_000
     for first, second, size in ((0, 8, 8), (0, 4096, 512), (4096, 8192, 4096), (0, 100_000, 1)):
         data = bytearray(good)
@@ -248,7 +243,7 @@ def test_a_header_is_not_believed(tmp_path, rng):
         return lambda told: told | {"arrays": [change(list(told["arrays"][0]))]}
 
     path.write_bytes(entry(text, arrays))
-    assert same(cache.load(KEY), arrays)
+    assert same_bits(cache.load(KEY), arrays)
     for change in (
         lambda told: [],
         lambda told: {"key": text},
@@ -277,7 +272,7 @@ def test_arrays_that_are_not_what_is_wanted_are_none(tmp_path, rng):
         return cache.load(KEY, lambda found: array_cache.holds(found, wanted))
 
     right = {"a": ("f8", (3, None)), "n": ("i8", ())}
-    assert same(load(**right), arrays)
+    assert same_bits(load(**right), arrays)
     for odd in ({"a": ("f4", (3, 4))}, {"a": ("f8", (4, 3))}, {"a": ("f8", (12,))}, {"b": ("f8", (1,))}):
         assert load(**right | odd) is None
     assert load(n=right["n"]) is None
@@ -308,7 +303,7 @@ def test_a_folder_that_others_own_or_write_to_is_not_used(tmp_path, rng, monkeyp
     cache.store(KEY | {"seed": 4}, arrays)
     assert len(cache.files()) == 1
     (tmp_path / "kept").chmod(0o755)
-    assert same(cache.load(KEY), arrays)
+    assert same_bits(cache.load(KEY), arrays)
     monkeypatch.setattr(os, "geteuid", lambda: os.getuid() + 1)
     if os.getuid() != 0:  # what the system's user made is trusted
         assert cache.load(KEY) is None

@@ -13,6 +13,7 @@ from envedit import config
 from envedit.core.errors import InputError
 from envedit.solve import checkpoint, gauss_newton
 from envedit.solve.adam_loop import State
+from tests.oracles.matrix_renderer import same_bits
 
 PICTURE = np.arange(24, dtype=np.float32).reshape(2, 4, 3)
 
@@ -28,19 +29,14 @@ def example(rng):
     return state, optimiser, renderer
 
 
-def same(a, b):
-    return a.keys() == b.keys() and all(
-        np.asarray(a[k]).dtype == b[k].dtype and np.asarray(a[k]).tobytes() == b[k].tobytes()
-        and np.shape(a[k]) == b[k].shape for k in a
-    )  # fmt: skip
-
-
 def test_everything_comes_back_exactly(tmp_path, rng):
     state, optimiser, renderer = example(rng)
     checkpoint.save(tmp_path, "what", state, optimiser, renderer, PICTURE)
     found = checkpoint.load(tmp_path, "what")
     assert found[0] == state and json.dumps(found[0].history) == json.dumps(state.history)
-    assert same(optimiser, found[1]) and same(renderer, found[2]) and np.array_equal(found[3], PICTURE)
+    assert (
+        same_bits(optimiser, found[1]) and same_bits(renderer, found[2]) and np.array_equal(found[3], PICTURE)
+    )
     assert [path.name for path in tmp_path.iterdir()] == [checkpoint.NAME]
 
 

@@ -14,6 +14,7 @@ from envedit.losses import metrics, ssim
 from envedit.representations.siren import fit
 from envedit.representations.siren import network as siren
 from tests.oracles.kernels import launched
+from tests.oracles.matrix_renderer import arrays, same
 from tests.oracles.plain import plain_ssim_loss
 
 NETWORK = config.Representation(hidden=12, depth=1, coordinates="sphere")
@@ -27,14 +28,6 @@ def sky(rng, height=16, width=32, peak=50.0):
     sun = peak * np.exp(-((row - height * 0.3) ** 2 + (column - width * 0.6) ** 2) / 4)
     grain = 0.01 * rng.random((height, width, 3))
     return ((base + sun)[..., None] * [1.0, 0.9, 0.7] + grain).astype(np.float32)
-
-
-def same(a, b):
-    return a.keys() == b.keys() and all(np.array_equal(a[name], b[name]) for name in a)
-
-
-def numpy(params):
-    return {name: value.numpy() for name, value in params.items()}
 
 
 def tensors(params):
@@ -74,16 +67,6 @@ def test_constant_map_lies_in_the_middle_of_a_range_of_one(value):
     np.testing.assert_allclose(values, 0.5)
     decoded = normalisation.decode(mi.TensorXf(values.astype(np.float32))).numpy()
     np.testing.assert_allclose(decoded, image, rtol=2e-5, atol=1e-8)
-
-
-@pytest.mark.parametrize("value", [0.0, 0.001, 3e38])
-@pytest.mark.parametrize("flat", [False, True])
-def test_decoded_radiance_is_always_finite_and_never_negative(value, flat):
-    """A whole rendering is NaN after one infinite texel, and the scene refuses a negative one."""
-    image = np.full((2, 4, 3), value) * (1 if flat else np.arange(24).reshape(2, 4, 3) / 23)
-    normalisation = fit.Normalisation.of(image)
-    decoded = normalisation.decode(mi.TensorXf(np.float32([0, 1e-30, 1e-7, 0.25, 1]))).numpy()
-    assert np.isfinite(decoded).all() and (decoded >= 0).all(), decoded
 
 
 @pytest.mark.parametrize("headroom", [0.0, 0.05, 0.45])
@@ -229,7 +212,7 @@ def test_perturbation_is_none_after_a_gradient_that_is_not_finite(rng):
     bad = good | {"1.weight": dr.opaque(mi.TensorXf, math.nan, (8, 8))}
     perturbation.update(good, 1e-4)
     perturbation.update(bad, 1e-4)  # nor does the direction of the update before it stay
-    assert same(numpy(perturbation.apply(params)), numpy(params))
+    assert same(arrays(perturbation.apply(params)), arrays(params))
 
 
 # ---- the fit ---------------------------------------------------------------------------------------------
@@ -318,7 +301,7 @@ def test_flat_maps_can_be_fitted(shape, value):
 
 
 def test_no_epochs_leaves_the_initial_weights(rng):
-    initial = numpy(siren.init(3, 12, 1, 30.0, inputs=3))
+    initial = arrays(siren.init(3, 12, 1, 30.0, inputs=3))
     image, settings = sky(rng), dataclasses.replace(QUICK, epochs=0, light=0.0)
     assert same(fit.fit(image, NETWORK, settings, seed=3).params, initial)
     solved = fit.fit(image, NETWORK, dataclasses.replace(settings, light=1.0), seed=3).params
@@ -411,37 +394,23 @@ def test_learning_rate_follows_the_schedule(schedule, expected):
 
 
 @pytest.mark.parametrize("black", [False, True])
-def test_a_fit_is_read_back_as_it_was(tmp_path, black, rng):
+def test_a_fit_is_read_back_as_it_was_and_a_damaged_one_made_again(tmp_path, black, rng):
     image = sky(rng) * (not black)
     made = fit.fit(image, NETWORK, QUICK, folder=tmp_path)
     found = fit.fit(image, NETWORK, QUICK, folder=tmp_path)
     assert (made.cached, found.cached) == (False, True)
     assert same(made.params, found.params) and list(made.params) == list(found.params)
     assert facts(found) == facts(made)
+    (path,) = tmp_path.iterdir()
+    path.write_bytes(path.read_bytes()[:-100])
+    again = fit.fit(image, NETWORK, QUICK, folder=tmp_path)
+    assert not again.cached and same(again.params, made.params)
 
 
 def test_the_cache_can_be_refused(tmp_path, rng):
     settings = dataclasses.replace(QUICK, cache=False)
     assert not fit.fit(sky(rng), NETWORK, settings, folder=tmp_path).cached
     assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("damage", ["truncated", "empty", "text", "changed"])
-def test_a_damaged_file_is_fitted_again(tmp_path, damage, rng):
-    image = sky(rng)
-    made = fit.fit(image, NETWORK, QUICK, folder=tmp_path)
-    (path,) = tmp_path.iterdir()
-    data = bytearray(path.read_bytes())
-    if damage == "changed":
-        weights = data.index(made.params["1.weight"].tobytes())
-        data[weights : weights + 4] = b"\xff" * 4  # a NaN
-    if damage == "truncated":
-        data = data[: len(data) // 2]
-    path.write_bytes({"empty": b"", "text": b"not a fit"}.get(damage, data))
-    again = fit.fit(image, NETWORK, QUICK, folder=tmp_path)
-    assert not again.cached and same(again.params, made.params)
-    assert fit.fit(image, NETWORK, QUICK, folder=tmp_path).cached
 
 
 @pytest.mark.slow

@@ -93,15 +93,6 @@ def test_weights_that_are_all_zero_give_zero_not_nan(name, rng):
 
 
 @pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("shape", [(1, 1, 3), (12, 2, 3)])
-@pytest.mark.parametrize("level", [0.0, 1e-30, 1e6])
-def test_any_shape_and_level_is_finite(name, shape, level, rng):
-    x, y = single(level * rng.random(shape)), single(rng.random(shape))
-    value, g = gradient(lambda t: loss(name, t, y), x)
-    assert np.isfinite(value) and np.isfinite(g).all() and g.shape == shape
-
-
-@pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_a_bad_texel_is_not_hidden(name, bad, rng):
     x, y = rng.random((12, 15, 3)), rng.random((12, 15, 3))

@@ -1,20 +1,15 @@
 """Checks of configuration values: what is refused, how it is told, and what is normalised."""
 
 import dataclasses
-import tomllib
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from envedit import config as cfg
 from envedit.config.key_validators import plain as nested_value
 from envedit.config.validators import WantedError
 from envedit.core.errors import ConfigError
 from tests.oracles.builders import refused
-
-quick = settings(deadline=None, max_examples=150, suppress_health_check=[HealthCheck.too_slow])
 
 
 @pytest.mark.parametrize(
@@ -66,25 +61,6 @@ def test_numbers_are_normalised():
     assert type(config.fit.lr) is float and type(config.fit.epochs) is int
     assert config.loss.ssim == (1.0, 2.0)
     assert type(cfg.loads("[fit]\nlr = 1").fit.lr) is float
-
-
-words = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"), max_size=12)
-numbers = st.floats(width=32, allow_nan=False, allow_infinity=False, allow_subnormal=False)
-rates = st.floats(2.0**-100, 1e6)
-plain = st.recursive(
-    words | numbers | st.booleans() | st.integers(-(2**63), 2**63 - 1),
-    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(words, inner, max_size=3),
-    max_leaves=6,
-)
-
-
-@pytest.mark.slow
-@quick
-@given(st.dictionaries(words, plain, max_size=3))
-def test_nested_values_are_written_and_come_back(table):
-    """TOML's own parser reads what is written."""
-    found = nested_value(table)
-    assert tomllib.loads(f"a = {cfg.quote(found)}")["a"] == found == table
 
 
 def test_too_deep_a_value_is_refused():

@@ -68,13 +68,16 @@ def test_views_are_scaled_each_by_itself(rng):
     assert np.array_equal(working_size.at_size(blocks, to, of), blocks.repeat(2, axis=0).repeat(2, axis=1))
 
 
+def targets(asked, lit):
+    """Return the target on the whole film, and on the smaller one."""
+    wanted = target.make(asked, lit, SKY)
+    return wanted, working_size.worked_on(asked, lit, working_size.smaller(asked, lit), SKY, wanted)
+
+
 @pytest.mark.slow
 def test_a_rendered_target_is_rendered_on_the_smaller_film():
     asked = settings(target={"rotate_degrees": 90.0, "spp": 64})
-    lit = scene.load("sphere", 24)
-    small = working_size.smaller(asked, lit)
-    wanted = target.make(asked, lit, SKY)
-    found = working_size.worked_on(asked, lit, small, SKY, wanted)
+    wanted, found = targets(asked, scene.load("sphere", 24))
     assert found.picture.shape == (12, 12, 3) and found.envmap is wanted.envmap and found.weight is None
     blocks = wanted.picture.reshape(12, 2, 12, 2, 3).mean(axis=(1, 3))
     assert np.abs(found.picture - blocks).mean() < 0.1 * blocks.mean()
@@ -88,9 +91,7 @@ def test_a_picture_of_the_scene_is_made_smaller_and_less_noisy(tmp_path):
     images.write_exr(tmp_path / "a.exr", picture, panorama=False)
     asked = settings(scene={"file": "sphere", "width": 48}, renderer={"pixels": 600})
     asked = replace(asked, target=config.Target(kind="rendering", file=str(tmp_path / "a.exr"), spp=16))
-    small = working_size.smaller(asked, lit)
-    wanted = target.make(asked, lit, SKY)
-    found = working_size.worked_on(asked, lit, small, SKY, wanted)
+    wanted, found = targets(asked, lit)
     blocks = picture.reshape(24, 2, 24, 2, 3).mean(axis=(1, 3))
     np.testing.assert_allclose(found.picture, blocks, rtol=1e-5)
     assert found.weight is None and found.coverage is None and found.noise.shape == (24, 24)
@@ -100,10 +101,7 @@ def test_a_picture_of_the_scene_is_made_smaller_and_less_noisy(tmp_path):
 @pytest.mark.slow
 def test_paint_keeps_its_change_and_its_weight():
     asked = settings(target={"kind": "strokes", "strokes": [SQUARE], "spp": 64})
-    lit = scene.load("sphere", 24)
-    small = working_size.smaller(asked, lit)
-    wanted = target.make(asked, lit, SKY)
-    found = working_size.worked_on(asked, lit, small, SKY, wanted)
+    wanted, found = targets(asked, scene.load("sphere", 24))
     change = (wanted.picture - wanted.initial).reshape(12, 2, 12, 2, 3).mean(axis=(1, 3))
     np.testing.assert_allclose(found.picture - found.initial, change, atol=1e-5)
     assert found.coverage.mean() == pytest.approx(wanted.coverage.mean(), rel=1e-5)

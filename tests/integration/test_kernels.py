@@ -12,18 +12,9 @@ from tests.oracles.kernels import compiled, history
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("own_core")]
 
-SMALL = [
-    "input.width=64",
-    "scene.width=32",
-    "fit.epochs=30",
-    "fit.cache=false",
-    "renderer.cache=false",
-    "representation.hidden=32",
-    "target.spp=32",
-    "output.spp=16",
-    "renderer.spp=64",
-    "optimizer.iterations=45",
-]
+SMALL = ["input.width=64", "scene.width=32", "fit.epochs=30", "fit.cache=false", "renderer.cache=false"]
+SMALL += ["representation.hidden=32", "target.spp=32", "output.spp=16", "renderer.spp=64"]
+SMALL += ["optimizer.iterations=45"]
 ADAM = ["optimizer.kind=adam", "representation.turn=false"]  # a turned map would be the result without a step
 
 

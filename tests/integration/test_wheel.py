@@ -12,18 +12,11 @@ from pathlib import Path
 import pytest
 
 import envedit
+from tests.oracles import ROOT
 
 pytestmark = pytest.mark.slow
-ROOT = Path(__file__).parents[2]
-SMALL = (
-    "input.width=16",
-    "scene.width=8",
-    "optimizer.iterations=2",
-    "renderer.spp=4",
-    "renderer.max_depth=3",
-    "target.spp=4",
-    "output.spp=4",
-)
+SMALL = ["input.width=16", "scene.width=8", "optimizer.iterations=2"]
+SMALL += ["renderer.spp=4", "renderer.max_depth=3", "target.spp=4", "output.spp=4"]
 
 
 def call(*command, cwd, **environment):

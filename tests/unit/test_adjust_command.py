@@ -88,17 +88,8 @@ def test_an_even_map_stays_even(value):
 def test_the_command_keeps_format_and_colour_space_and_writes_a_backplate(rng, capsys, here):
     sky = sunny(rng, peak=500.0)
     images.write_exr("sky.exr", sky, half=True, chromaticities=primaries.ACES_AP1)
-    given = [
-        "sky.exr",
-        "--exposure",
-        "1",
-        "--background",
-        "plate.exr",
-        "--background-exposure",
-        "-2",
-        "--json",
-    ]
-    assert adjust.main(given) == 0
+    plate = ["--background", "plate.exr", "--background-exposure", "-2"]
+    assert adjust.main(["sky.exr", "--exposure", "1", *plate, "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["files"] == {
         "map": "sky_adjusted.exr",
         "background": "plate.exr",

@@ -2,11 +2,9 @@
 
 import re
 from dataclasses import asdict
-from pathlib import Path
 
 from envedit.core import seeds
-
-ROOT = Path(__file__).parents[2]
+from tests.oracles import ROOT
 
 
 def test_seeds_are_those_that_results_were_made_with():

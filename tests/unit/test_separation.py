@@ -380,14 +380,8 @@ def test_a_label_grows_into_what_has_none():
 
 # ---- real maps ---------------------------------------------------------------------------------------------
 
-SUNNY = [
-    "autumn_field",
-    "kloofendal_48d_partly_cloudy",
-    "rustig_koppie",
-    "sunflowers",
-    "syferfontein_18d_clear",
-]
 CLEAR = ["autumn_field", "rustig_koppie", "syferfontein_18d_clear"]
+SUNNY = [*CLEAR, "kloofendal_48d_partly_cloudy", "sunflowers"]
 OVERCAST = ["mud_road", "overcast_soil", "snow_field", "kloppenheim_06"]
 
 

@@ -268,23 +268,6 @@ def stopping(sampled):
 
 
 @pytest.mark.slow
-def test_caches_without_room_cost_nothing_but_time(tmp_path, whole, monkeypatch):
-    path, reference = whole
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    replace = os.replace
-
-    def full(source, target):
-        if Path(target).name not in output_folder.RESULTS:
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        replace(source, target)
-
-    monkeypatch.setattr(atomic_files.os, "replace", full)
-    assert call(path, "--quiet", "--out", tmp_path / "out") == 0
-    assert differing(tmp_path / "out", reference) == set()
-    assert not [file for file in (tmp_path / "cache").rglob("*") if file.is_file()]
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("stage", ["editing", "writing"])
 def test_a_folder_that_is_gone_is_told(stage, tmp_path, whole, monkeypatch, capsys):
     path, _ = whole

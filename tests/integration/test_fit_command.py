@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from envedit import config
-from envedit.cli import doctor
 from envedit.cli import fit as fit_command
 from envedit.images import images
 from envedit.losses import metrics
@@ -16,11 +15,7 @@ from tests.oracles.builders import sky
 SMALL = ["input.width=16", "representation.hidden=10", "representation.depth=1", "fit.epochs=4"]
 
 
-@pytest.fixture(autouse=True)
-def isolated(tmp_path, monkeypatch):
-    """Keep fits to this test, and do not probe a machine that runs these very tests."""
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setattr(doctor, "ensure", lambda variant: None)
+pytestmark = pytest.mark.usefixtures("isolated")
 
 
 def call(path, out, *overrides):

@@ -17,7 +17,7 @@ from envedit.report import map_files
 from envedit.representations.layers.separation import separate
 from tests.oracles import users_scenes
 from tests.oracles.builders import BALL, sky
-from tests.oracles.runs import TINY, call, changed, content, measured, pixels
+from tests.oracles.runs import TINY, as_toml, call, changed, content, measured, pixels, small_world
 from tests.oracles.users_scenes import FLOOR, HIDDEN, LAMP, SEEN, TURN, light
 
 pytestmark = pytest.mark.usefixtures("isolated")
@@ -31,18 +31,13 @@ def written(folder, parts, **tables):
         "target": {"spp": 1024, "rotate_degrees": 120.0},
         "renderer": {"spp": 256, "max_depth": 3},
     } | tables
-    lines = []
-    for table, keys in given.items():
-        lines += [f"[{table}]", *(f"{key} = {config.quote(value)}" for key, value in keys.items())]
-    (folder / "c.toml").write_text("\n".join(lines), encoding="utf-8")
+    (folder / "c.toml").write_text(as_toml(given), encoding="utf-8")
     return folder / "c.toml"
 
 
 @pytest.fixture(scope="module")
 def own(tmp_path_factory):
     """Return the folder of a run over a scene's own map, with a scale, a lamp, and hidden emitters."""
-    from tests.oracles.runs import small_world
-
     folder = tmp_path_factory.mktemp("own")
     path = written(folder, (HIDDEN, SEEN, BALL, FLOOR, LAMP, light(0.55, TURN)))
     with small_world(folder / "cache"):

@@ -22,41 +22,19 @@ from envedit.losses.perceptual import installed
 from envedit.representations.layers import gain
 from envedit.representations.layers.placed_lights import angles, direction
 from envedit.scene import scene
-from envedit.solve import (
-    adam_loop,
-    checkpoint,
-    gauss_newton,
-    likelihood,
-    search,
-    transport_error,
-    turning,
-)
+from envedit.solve import adam_loop, checkpoint, gauss_newton, likelihood, search, transport_error, turning
 from envedit.targets import target
 from envedit.transport import recording
 from envedit.transport.light_transport import LightTransport
 from tests.oracles.builders import BALL, LIGHT, SENSOR, sky, write_scene
-from tests.oracles.runs import HEIGHT, WIDTH, settings_of, smooth, sunny
+from tests.oracles.matrix_renderer import without_times
+from tests.oracles.runs import HEIGHT, WIDTH, interrupting, merged, settings_of, smooth, sunny
 
 pytestmark = pytest.mark.usefixtures("own_cache", "own_core")
 
 PIXELS = {"representation": {"kind": "pixels"}}
 ADAM = {"optimizer": {"iterations": 20, "kind": "adam"}}
 STROKES = [{"type": "light", "ellipse": [0.45, 0.4, 0.15, 0.15], "amount": 2.0}]
-
-
-def interrupting(stage="editing"):
-    """Return a Watch that sends Ctrl-C with each progress of the edit, or of another stage."""
-    stages = []
-
-    def progress(done, total, text):
-        if stages[-1] == stage:
-            signal.raise_signal(signal.SIGINT)
-
-    return pipeline.Watch(stages.append, progress)
-
-
-def without_times(history):
-    return [{key: value for key, value in row.items() if key != "step_ms"} for row in history]
 
 
 def without_timing(measured):
@@ -66,6 +44,20 @@ def without_timing(measured):
         for part in ("fit", "transport")
     }
     return {**measured, "timing": None, **parts}
+
+
+def looked_at_every(steps, monkeypatch):
+    """Let a run with Adam look for Ctrl-C after so many steps, also on a busy machine."""
+    monkeypatch.setattr(adam_loop, "READ_EVERY", steps)
+    monkeypatch.setattr(adam_loop, "READ_SECONDS", np.inf)
+
+
+def assert_same(resumed, whole):
+    """Compare all but times of a resumed run and one that was not interrupted."""
+    assert resumed.envmap.tobytes() == whole.envmap.tobytes()
+    assert all(resumed.renders[key].tobytes() == whole.renders[key].tobytes() for key in whole.renders)
+    assert without_times(resumed.history) == without_times(whole.history)
+    assert without_timing(resumed.metrics) == without_timing(whole.metrics)
 
 
 # ---- what comes back -------------------------------------------------------------------------------------
@@ -127,13 +119,6 @@ def test_active_rows(rows, height, active):
         assert (elevation[: last + 1] >= 0).all() and (elevation[last + 1 :] < 0).all()
 
 
-def test_the_upper_rows_are_those_above_the_horizon():
-    for height in (3, 8, 65, 128):
-        up = latlong.directions(height, 2 * height)[..., 1]
-        last = inputs.active_rows("upper", height).last
-        assert (up[: last + 1] > -1e-6).all() and (up[last + 1 :] < 0).all()
-
-
 @pytest.mark.slow
 def test_pictures_that_are_compared_share_no_seed(tmp_path, rng, monkeypatch):
     """The target draws samples of its own; both judged pictures have the same ones."""
@@ -167,18 +152,25 @@ PLATE = """<sensor type="perspective"><float name="fov" value="30"/>
     </transform></shape>"""
 
 
+def plated(folder, picture, **tables):
+    """Return the configuration of a run on all rows of a 64 x 32 map whose plate sees the half with x > 0."""
+    given = {"input": {"rows": "all", "width": 64}, "renderer": {"spp": 256, "max_depth": 3}} | tables
+    settings = settings_of(folder, picture, **given)
+    write_scene(folder, PLATE, LIGHT, name="scene.xml")
+    return settings
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["layers", "siren"])
 def test_texels_behind_the_only_surface_keep_their_value(kind, tmp_path, rng):
     """A plate that faces +x fills the picture: of the map it sees the half with x > 0."""
     picture = 0.2 * sky(rng, 32, 64) + 0.3
     images.write_exr(tmp_path / "brighter.exr", 2 * picture)
-    settings = settings_of(
+    settings = plated(
         tmp_path, picture, input={"rows": "all", "horizon": "free", "width": 64},
         representation={"kind": kind, "hidden": 16, "depth": 1}, target={"file": "brighter.exr"},
-        renderer={"spp": 256, "max_depth": 3}, optimizer={"kind": "adam", "iterations": 5, "lr": 1e-2},
+        optimizer={"kind": "adam", "iterations": 5, "lr": 1e-2},
     )  # fmt: skip
-    write_scene(tmp_path, PLATE, LIGHT, name="scene.xml")
     found = pipeline.run(settings)
     original, x = found.maps["initial"], latlong.directions(32, 64)[..., 0]
     assert not found.frozen[x > 0].any() and found.frozen[x < -0.5].all()
@@ -196,14 +188,6 @@ def test_texels_behind_the_only_surface_keep_their_value(kind, tmp_path, rng):
         assert free.frozen is None or not free.frozen.any()
         assert (free.envmap != original)[x < -0.5].any() or kind == "pixels"
         assert not any("keep their value" in line for line in free.metrics["choices"])
-
-
-def plated(folder, picture, **tables):
-    """Return the configuration of a run on all rows of a 64 x 32 map whose plate sees the half with x > 0."""
-    given = {"input": {"rows": "all", "width": 64}, "renderer": {"spp": 256, "max_depth": 3}} | tables
-    settings = settings_of(folder, picture, **given)
-    write_scene(folder, PLATE, LIGHT, name="scene.xml")
-    return settings
 
 
 @pytest.mark.slow
@@ -520,8 +504,7 @@ def test_an_interrupted_run_ends_with_the_same_bits(name, tmp_path, rng, monkeyp
     whole = pipeline.run(settings)
     assert (whole.envmap != picture).any()
 
-    monkeypatch.setattr(adam_loop, "READ_EVERY", 13)
-    monkeypatch.setattr(adam_loop, "READ_SECONDS", 1e9)
+    looked_at_every(13, monkeypatch)
     folder = tmp_path / "run"
     folder.mkdir()
     for step in (13, 20):
@@ -536,22 +519,7 @@ def test_an_interrupted_run_ends_with_the_same_bits(name, tmp_path, rng, monkeyp
             assert len(columns) > 1  # one is always traced, in the first step, so that its kernels are there
     assert stop.value.envmap.tobytes() == whole.envmap.tobytes()
 
-    resumed = pipeline.run(settings, folder=folder, resume=True)
-    assert resumed.envmap.tobytes() == whole.envmap.tobytes()
-    assert all(resumed.renders[key].tobytes() == whole.renders[key].tobytes() for key in whole.renders)
-    assert without_times(resumed.history) == without_times(whole.history)
-    assert without_timing(resumed.metrics) == without_timing(whole.metrics)
-
-
-def stopping_at(step):
-    """Return a Watch that sends Ctrl-C after one step of the edit."""
-    stages = []
-
-    def progress(done, total, text):
-        if stages[-1] == "editing" and done == step:
-            signal.raise_signal(signal.SIGINT)
-
-    return pipeline.Watch(stages.append, progress)
+    assert_same(pipeline.run(settings, folder=folder, resume=True), whole)
 
 
 @pytest.mark.slow
@@ -571,17 +539,14 @@ def test_an_interrupted_gauss_newton_run_ends_with_the_same_bits(tmp_path, rng, 
     tried = min(steps, search.EXPLANATION_STEPS)  # from where the best explanation goes on
     for step in sorted({tried, max(tried, steps // 2), steps}):
         with pytest.raises(pipeline.Interrupted, match=f"iteration {step}") as stop:
-            pipeline.run(settings, folder=folder, resume=True, watch=stopping_at(step))
+            pipeline.run(settings, folder=folder, resume=True, watch=interrupting(step=step))
         assert stop.value.step == step and np.isfinite(stop.value.envmap).all()
         with np.load(folder / checkpoint.NAME) as stored:
             assert json.loads(stored["meta"].tobytes())["state"]["step"] == step
     assert stop.value.envmap.tobytes() == whole.envmap.tobytes()
     resumed = pipeline.run(settings, folder=folder, resume=True)
-    assert resumed.envmap.tobytes() == whole.envmap.tobytes()
     assert resumed.posterior.deviation.tobytes() == whole.posterior.deviation.tobytes()
-    assert all(resumed.renders[key].tobytes() == whole.renders[key].tobytes() for key in whole.renders)
-    assert without_times(resumed.history) == without_times(whole.history)
-    assert without_timing(resumed.metrics) == without_timing(whole.metrics)
+    assert_same(resumed, whole)
 
 
 @pytest.mark.slow
@@ -607,14 +572,11 @@ def test_a_mirror_gets_finer_grids_and_more_samples_and_goes_on_where_it_stopped
     assert len(levels) > gain.LEVELS
     assert all(np.abs(whole.found.params[name].numpy()).max() > 0 for name in levels)
 
-    monkeypatch.setattr(adam_loop, "READ_EVERY", 7)
-    monkeypatch.setattr(adam_loop, "READ_SECONDS", np.inf)  # a busy machine would read earlier
+    looked_at_every(7, monkeypatch)
     (tmp_path / "run").mkdir()
     with pytest.raises(pipeline.Interrupted, match="iteration 7"):
         pipeline.run(settings, folder=tmp_path / "run", watch=interrupting())
-    resumed = pipeline.run(settings, folder=tmp_path / "run", resume=True)
-    assert resumed.envmap.tobytes() == whole.envmap.tobytes()
-    assert without_timing(resumed.metrics) == without_timing(whole.metrics)
+    assert_same(pipeline.run(settings, folder=tmp_path / "run", resume=True), whole)
 
 
 @pytest.mark.slow
@@ -623,8 +585,7 @@ def test_an_interrupted_run_of_the_path_tracer_goes_on_where_it_stopped(tmp_path
     renderer = {"kind": "path", "spp": 4, "max_depth": 3}
     settings = settings_of(tmp_path, smooth(rng), renderer=renderer, optimizer={"iterations": 10})
     whole = pipeline.run(settings)
-    monkeypatch.setattr(adam_loop, "READ_EVERY", 7)
-    monkeypatch.setattr(adam_loop, "READ_SECONDS", np.inf)  # a busy machine would read earlier
+    looked_at_every(7, monkeypatch)
     (tmp_path / "run").mkdir()
     with pytest.raises(pipeline.Interrupted):
         pipeline.run(settings, folder=tmp_path / "run", watch=interrupting())
@@ -652,50 +613,36 @@ def test_what_is_only_tried_is_not_the_map_so_far(tmp_path, rng):
     assert stop.value.envmap.tobytes() == original.tobytes()
 
 
-@pytest.mark.slow
-def test_a_checkpoint_of_something_else_is_refused(tmp_path, rng, monkeypatch):
-    folder = tmp_path / "run"
-    folder.mkdir()
-    picture = sunny(rng)
-    settings = settings_of(tmp_path, picture, optimizer={"iterations": 3}, **PIXELS)
-    with pytest.raises(pipeline.Interrupted):
-        pipeline.run(settings, folder=folder, watch=interrupting())
-    stored = (folder / checkpoint.NAME).read_bytes()
-    for other in (
-        settings_of(tmp_path, picture, optimizer={"iterations": 4}, **PIXELS),
-        settings_of(tmp_path, picture, optimizer={"iterations": 3}, loss={"tv": 0.1}, **PIXELS),
-        settings_of(tmp_path, np.flip(picture, 1).copy(), optimizer={"iterations": 3}, **PIXELS),  # same name
-    ):
-        with pytest.raises(InputError, match="another configuration or other input files"):
-            pipeline.run(other, folder=folder, resume=True)
-        assert (folder / checkpoint.NAME).read_bytes() == stored
-    # Without resume it is not looked at.
-    pipeline.run(settings_of(tmp_path, picture, optimizer={"iterations": 4}, **PIXELS), folder=folder)
+def assert_refused(settings, folder):
+    with pytest.raises(InputError, match="another configuration or other input files"):
+        pipeline.run(settings, folder=folder, resume=True)
 
 
 @pytest.mark.slow
-def test_a_checkpoint_of_another_mask_or_scene_is_refused(tmp_path, rng):
-    """Where the target is painted nothing but the file itself tells that it has changed."""
+def test_a_checkpoint_of_something_else_is_refused(tmp_path, rng):
+    """Where the target is painted nothing but the file of the mask itself tells that it has changed."""
     folder = tmp_path / "run"
     folder.mkdir()
-    mask = np.ones((18, 24, 3), np.float32)
+    picture, mask = sunny(rng), np.ones((18, 24, 3), np.float32)
     images.write_exr(tmp_path / "painted.exr", 0.5 * mask)
     images.write_exr(tmp_path / "mask.exr", mask)
     painted = {"kind": "image", "file": "painted.exr", "mask": "mask.exr"}
-    settings = settings_of(tmp_path, sunny(rng), target=painted, optimizer={"iterations": 3}, **PIXELS)
+    tables = PIXELS | {"target": painted, "optimizer": {"iterations": 3}}
+    settings = settings_of(tmp_path, picture, **tables)
     with pytest.raises(pipeline.Interrupted):
         pipeline.run(settings, folder=folder, watch=interrupting())
+    stored = (folder / checkpoint.NAME).read_bytes()
 
-    half = mask.copy()
-    half[:9] = 0
-    images.write_exr(tmp_path / "mask.exr", half)
-    with pytest.raises(InputError, match="another configuration or other input files"):
-        pipeline.run(settings, folder=folder, resume=True)
-
+    more = settings_of(tmp_path, picture, **tables | {"optimizer": {"iterations": 4}})
+    assert_refused(more, folder)
+    assert_refused(settings_of(tmp_path, np.flip(picture, 1).copy(), **tables), folder)  # of the same name
+    images.write_exr(tmp_path / "mask.exr", np.concatenate([0 * mask[:9], mask[9:]]))
+    assert_refused(settings_of(tmp_path, picture, **tables), folder)
     images.write_exr(tmp_path / "mask.exr", mask)
     write_scene(tmp_path, SENSOR, BALL.replace("0.2, 0.4, 0.6", "0.6, 0.4, 0.2"), LIGHT, name="scene.xml")
-    with pytest.raises(InputError, match="another configuration or other input files"):
-        pipeline.run(settings, folder=folder, resume=True)
+    assert_refused(settings, folder)
+    assert (folder / checkpoint.NAME).read_bytes() == stored
+    pipeline.run(more, folder=folder)  # without resume it is not looked at
 
 
 @pytest.mark.slow
@@ -706,8 +653,7 @@ def test_a_run_is_resumed_although_mitsuba_renders_the_target_anew(tmp_path, rng
     """
     settings = settings_of(tmp_path, sunny(rng), **PIXELS)
     whole = pipeline.run(settings)
-    monkeypatch.setattr(adam_loop, "READ_EVERY", 7)
-    monkeypatch.setattr(adam_loop, "READ_SECONDS", np.inf)  # a busy machine would read earlier
+    looked_at_every(7, monkeypatch)
     folder = tmp_path / "run"
     folder.mkdir()
     with pytest.raises(pipeline.Interrupted):
@@ -799,9 +745,7 @@ def turned_world(tmp_path, rng, **tables):
         "representation": {"turn": "auto"},
         "renderer": {"spp": 128, "max_depth": 3},
     }
-    for table, keys in tables.items():
-        asked[table] = asked.get(table, {}) | keys
-    return settings_of(tmp_path, picture, **asked), picture
+    return settings_of(tmp_path, picture, **merged(asked, tables)), picture
 
 
 @pytest.mark.slow

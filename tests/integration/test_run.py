@@ -13,7 +13,6 @@ import sys
 import time
 from pathlib import Path
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import OpenEXR
@@ -24,7 +23,7 @@ from envedit.cli import run
 from envedit.core.color import tonemap
 from envedit.images import images
 from envedit.losses.perceptual import installed
-from envedit.solve import adam_loop, checkpoint, edit_job, map_problem
+from envedit.solve import adam_loop, checkpoint
 from envedit.transport.light_transport import LightTransport
 from tests.oracles import ROOT
 from tests.oracles.builders import read_png, sky
@@ -34,7 +33,6 @@ from tests.oracles.runs import (
     call,
     changed,
     content,
-    differing,
     measured,
     names,
     no_constant,
@@ -87,20 +85,8 @@ def test_metrics_have_the_documented_keys_and_no_value_that_is_not_finite(done):
     image_keys = {"psnr", "ssim", "mse", "lpips", "log_rmse", "beyond_display"}
     assert set(found["render"]) == set(found["initial"]) == set(found["envmap"]) == image_keys
     assert set(found["fit"]) == {"log_psnr", "peak_ratio", "epochs", "cached", "seconds"}
-    timing = {
-        "import",
-        "target",
-        "fit",
-        "transport",
-        "reach",
-        "start",
-        "edit",
-        "solve",
-        "judge",
-        "full",
-        "report",
-        "total",
-    }
+    timing = {"import", "target", "fit", "transport", "reach", "start", "edit"}
+    timing |= {"solve", "judge", "full", "report", "total"}
     assert set(found["timing"]) == {f"{part}_s" for part in timing} | {"per_iteration_ms"}
     assert found["timing"]["start_s"] == 0 < found["timing"]["fit_s"]
     assert {"iterations", "non_finite_steps", "tonemap", "active_rows", "choices"} <= set(found)
@@ -246,20 +232,6 @@ def test_the_judged_rendering_is_what_mitsuba_makes_of_the_written_file(tmp_path
 
 
 @pytest.mark.slow
-def test_without_iterations_the_map_is_the_original_and_its_two_renderings_are_the_same(tmp_path, rng):
-    path = world(
-        tmp_path, rng, representation={"kind": "pixels"}, optimizer={"iterations": 0}, output={"spp": 256}
-    )
-    assert call(path, "--quiet") == 0
-    out = tmp_path / "c_out"
-    assert pixels(out / "edited.exr").tobytes() == pixels(tmp_path / "map.exr").tobytes()
-    a, b = pixels(out / "render_initial.exr"), pixels(out / "render_edited.exr")
-    assert a.tobytes() == b.tobytes()  # judged with the same samples
-    found = measured(out)
-    assert found["iterations"] == 0 and found["timing"]["per_iteration_ms"] is None and rows_of(out) == []
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "renderer"),
     [*((kind, "transport") for kind in ("layers", "siren", "pixels", "log-pixels")), ("siren", "path")],
@@ -310,43 +282,21 @@ def test_a_map_without_light_is_edited_all_the_same(value, kind, tmp_path, rng, 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("value", [65504.0, 1e6, 1e30])
-def test_a_sun_of_any_radiance_is_edited_to_finite_values(value, tmp_path, rng):
-    path = world(tmp_path, rng)
-    bright = sky(rng)
-    bright[2, 5] = value
-    images.write_exr(tmp_path / "map.exr", bright)
-    assert call(path, "--quiet") == 0
-    assert all(math.isfinite(number) for number in numbers(measured(tmp_path / "c_out")))
-
-
-@pytest.mark.slow
-def test_layers_without_iterations_are_the_map_as_it_is(tmp_path, rng):
-    path = world(tmp_path, rng, target={"rotate_degrees": 90.0, "spp": 64}, optimizer={"iterations": 0})
-    images.write_exr(tmp_path / "map.exr", one_sun(1, 3))
-    assert call(path, "--quiet", *changed(renderer__spp=256)) == 0
-    found = measured(tmp_path / "c_out")
-    assert found["iterations"] == 0 and found["fit"] is None
-    assert found["envmap"] == found["initial_envmap"]
-    assert any("100 % of the active texels are unchanged" in line for line in found["choices"])
-
-
-def one_sun(row, column):
-    picture = np.full((8, 16, 3), 0.3, np.float32)
-    picture[row, column] = 60
-    return picture
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("spp", [16, "auto"])
-def test_initial_rendering_and_result_are_judged_with_the_same_samples(tmp_path, rng, spp):
+@pytest.mark.parametrize(("kind", "spp"), [("pixels", 16), ("pixels", "auto"), ("layers", 16)])
+def test_initial_rendering_and_result_are_judged_with_the_same_samples(kind, spp, tmp_path, rng):
     """So that a map in which nothing changes has the same score."""
-    path = world(tmp_path, rng, optimizer={"iterations": 0}, output={"spp": spp})
+    target = {"rotate_degrees": 90.0, "spp": 16}
+    path = world(tmp_path, rng, optimizer={"iterations": 0}, output={"spp": spp}, target=target)
     out = tmp_path / "out"
-    assert call(path, "--quiet", "--out", out, *changed(representation__kind="pixels")) == 0
+    assert call(path, "--quiet", "--out", out, *changed(representation__kind=kind)) == 0
     assert pixels(out / "edited.exr").tobytes() == pixels(tmp_path / "map.exr").tobytes()
     found = measured(out)
     assert found["render"] == found["initial"] and found["worse"] is False
+    assert found["envmap"] == found["initial_envmap"] and found["fit"] is None
+    assert found["iterations"] == 0 and found["timing"]["per_iteration_ms"] is None and not rows_of(out)
+    assert any("100 % of the active texels are unchanged" in line for line in found["choices"]) == (
+        kind == "layers"
+    )
     assert pixels(out / "render_initial.exr").tobytes() == pixels(out / "render_edited.exr").tobytes()
 
 
@@ -557,12 +507,6 @@ def test_ctrl_c_inside_an_operation_is_ctrl_c(tmp_path, rng, capsys, monkeypatch
 
 
 @pytest.mark.slow
-def test_resume_in_an_empty_folder_is_a_run(tmp_path, rng):
-    assert call(world(tmp_path, rng), "--resume", "--quiet", *changed(optimizer__iterations=1)) == 0
-    assert names(tmp_path / "c_out") >= FILES
-
-
-@pytest.mark.slow
 def test_a_changed_configuration_is_not_resumed(tmp_path, rng, capsys, monkeypatch):
     path, out = world(tmp_path, rng, optimizer={"iterations": 4, "checkpoint_s": 0.0}), tmp_path / "c_out"
     save = checkpoint.save
@@ -615,30 +559,6 @@ def test_an_interrupt_while_results_are_written_names_the_checkpoint(tmp_path, r
     assert call(path, "--quiet", "--resume") == 0 and "metrics.json" in names(tmp_path / "c_out")
 
 
-class NotANumber:
-    """A renderer whose picture is NaN."""
-
-    choices, transport = (), None
-
-    def render(self, envmap, step):
-        return mi.TensorXf(dr.sum(envmap.array) + dr.opaque(mi.Float, math.nan, 18 * 24 * 3), (18, 24, 3))
-
-    def state(self):
-        return {}
-
-
-@pytest.mark.slow
-def test_an_edit_that_cannot_go_on_leaves_the_last_good_map(tmp_path, rng, capsys, monkeypatch):
-    monkeypatch.setattr(pipeline.renderers, "make", lambda *_: NotANumber())
-    path = world(tmp_path, rng, representation={"kind": "pixels"})
-    assert call(path, "--quiet", *changed(optimizer__iterations=50)) == 5
-    said = capsys.readouterr().err
-    assert len(said.splitlines()) <= 2 and "20 steps in a row" in said and "lr" in said
-    out = tmp_path / "c_out"
-    assert pixels(out / "edited.exr").tobytes() == pixels(tmp_path / "map.exr").tobytes()
-    assert not names(out) & {"metrics.json", "render_edited.exr"}
-
-
 def started(path, cache, *arguments):
     environment = os.environ | {"XDG_CACHE_HOME": str(cache)}
     command = [sys.executable, "-m", "envedit.run", str(path), *arguments]
@@ -657,44 +577,6 @@ def stop_at_checkpoint(process, file, number):
     finally:
         process.kill()
     return process.returncode, out, err
-
-
-@pytest.mark.slow
-def test_gauss_newton_interrupted_in_a_step_resumes_to_the_same_files(tmp_path, rng, monkeypatch, capsys):
-    settings = {"optimizer": {"kind": "gauss-newton", "iterations": 8}}
-    path, out = world(tmp_path, rng, **settings), tmp_path / "c_out"
-    assert call(path, "--quiet", "--out", tmp_path / "whole") == 0
-    normal, calls = map_problem.Problem.normal, []
-
-    def pressed(self, *arguments, **more):
-        calls.append(arguments)
-        if len(calls) == 2:
-            signal.raise_signal(signal.SIGINT)
-        return normal(self, *arguments, **more)
-
-    optimise = edit_job.Job.optimise
-
-    def steps_only(*arguments):  # not those of the search
-        with monkeypatch.context() as patch:
-            patch.setattr(map_problem.Problem, "normal", pressed)
-            return optimise(*arguments)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(edit_job.Job, "optimise", steps_only)
-        assert call(path, "--quiet") == 130
-    assert calls and "--resume" in capsys.readouterr().err
-    assert names(out) == {"checkpoint.npz", "edited.exr"}
-    assert call(path, "--quiet", "--resume") == 0
-    assert names(out) == FILES | INFLUENCE and differing(out, tmp_path / "whole") == set()
-
-    rows = rows_of(out)
-    assert list(rows[0]) == ["iteration", "loss", "data", "prior", "sigma", "residual", "damping", "step_ms"]
-    assert [int(row["iteration"]) for row in rows] == list(range(len(rows))) and 2 < len(rows) <= 8
-    for row, other in zip(rows, rows_of(tmp_path / "whole"), strict=True):
-        values = {name: float(value) for name, value in row.items()}
-        assert all(math.isfinite(value) and value >= 0 for value in values.values())
-        assert values["loss"] == pytest.approx(values["data"] + values["prior"], rel=1e-5)
-        assert row | {"step_ms": ""} == other | {"step_ms": ""}
 
 
 @pytest.mark.slow
@@ -742,13 +624,6 @@ def test_help_needs_no_renderer(tmp_path):
     assert found.returncode == 0, found.stderr
     for option in ("CONFIG.toml", "--out", "--preset", "--set", "--resume", "--quiet"):
         assert option in found.stdout
-
-
-@pytest.mark.slow
-def test_doctor_finds_this_machine_well():
-    found = subprocess.run([sys.executable, "-m", "envedit.doctor"], cwd=ROOT, capture_output=True, text=True)
-    assert found.returncode == 0, found.stderr
-    assert "llvm_ad_rgb: ready" in found.stdout and found.stderr == ""
 
 
 # ---- the picture to paint on -----------------------------------------------------------------------------

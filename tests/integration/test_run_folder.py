@@ -2,30 +2,22 @@
 
 import json
 
-import mitsuba as mi
 import numpy as np
 import OpenEXR
 import pytest
 
-from envedit import config
-from envedit.cli import doctor, run
+from envedit.cli import run
 from envedit.core import latlong
 from envedit.export import file_resolution
 from envedit.images import images
 from tests.oracles.builders import BALL, LIGHT, SENSOR, write_scene
+from tests.oracles.maps import flux
+from tests.oracles.runs import TINY, as_toml, merged
+
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("isolated")]
 
 WIDTH = 64
 STROKE = {"type": "shadow", "rectangle": [0.3, 0.3, 0.7, 0.7], "amount": 0.5}
-
-
-@pytest.fixture(autouse=True)
-def small_world(tmp_path_factory, monkeypatch):
-    level = mi.log_level()
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
-    monkeypatch.setattr(doctor, "ensure", lambda variant: None)
-    yield
-    mi.set_variant("llvm_ad_rgb")
-    mi.set_log_level(level)
 
 
 def source(rng):
@@ -39,26 +31,13 @@ def carried_out(folder, picture, *arguments, **tables):
     """Run on the map with 16 working texels; returns the results' folder."""
     images.write_exr(folder / "map.exr", picture)
     write_scene(folder, SENSOR, BALL, LIGHT, name="scene.xml")
-    given = {
-        "input": {"envmap": "map.exr", "width": 16, "rows": "upper"},
-        "scene": {"file": "scene.xml", "width": 24},
-        "target": {"spp": 16},
-        "fit": {"epochs": 4},
-        "optimizer": {"iterations": 4},
-        "renderer": {"spp": 32, "max_depth": 3},
-        "output": {"spp": 16},
-    }
-    for table, keys in tables.items():
-        given[table] = given.get(table, {}) | keys
-    lines = []
-    for table, keys in given.items():
-        lines += [f"[{table}]", *(f"{key} = {config.quote(value)}" for key, value in keys.items())]
-    (folder / "c.toml").write_text("\n".join(lines))
+    files = {"input": {"envmap": "map.exr"}, "scene": {"file": "scene.xml"}}
+    tiny = {name: keys for name, keys in TINY.items() if name != "representation"}
+    (folder / "c.toml").write_text(as_toml(merged(tiny, files, tables)))
     assert run.main([str(folder / "c.toml"), "--quiet", *arguments]) == 0
     return folder / "c_out"
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["layers", "log-pixels"])
 def test_the_edit_is_carried_to_the_size_of_the_file(kind, tmp_path, rng):
     picture = source(rng)
@@ -67,12 +46,9 @@ def test_the_edit_is_carried_to_the_size_of_the_file(kind, tmp_path, rng):
     assert full.shape == picture.shape and edited.shape == (16, 32, 3)
     assert full[WIDTH // 4 :].tobytes() == picture[WIDTH // 4 :].tobytes()  # below the horizon
     assert not np.array_equal(full, picture)
-    omega = [latlong.lookup_solid_angles(*m.shape[:2])[:, None, None] for m in (full, edited)]
-    flux = [(m * o).sum((0, 1)) for m, o in zip((full, edited), omega, strict=True)]
-    np.testing.assert_allclose(*flux, rtol=0.02)
+    np.testing.assert_allclose(flux(full), flux(edited), rtol=0.02)
 
 
-@pytest.mark.slow
 def test_a_sky_without_a_file_and_a_file_that_is_no_larger_have_no_full_map(tmp_path, rng):
     (tmp_path / "a").mkdir()
     out = carried_out(tmp_path / "a", latlong.resize(source(rng), 8, 16))
@@ -82,7 +58,6 @@ def test_a_sky_without_a_file_and_a_file_that_is_no_larger_have_no_full_map(tmp_
     assert not (out / "edited_full.exr").exists()
 
 
-@pytest.mark.slow
 def test_without_memory_for_the_full_map_the_rest_is_written(tmp_path, rng, monkeypatch, capsys):
     def out_of_memory(*arguments):
         raise MemoryError
@@ -93,7 +68,6 @@ def test_without_memory_for_the_full_map_the_rest_is_written(tmp_path, rng, monk
     assert "not enough memory" in capsys.readouterr().err
 
 
-@pytest.mark.slow
 def test_a_file_that_is_gone_by_the_end_costs_the_full_map_alone(tmp_path, rng, monkeypatch, capsys):
     full = file_resolution.at_full_resolution
 
@@ -108,7 +82,6 @@ def test_a_file_that_is_gone_by_the_end_costs_the_full_map_alone(tmp_path, rng, 
     assert "edited_full.exr is not written" in said and "map.exr" in said
 
 
-@pytest.mark.slow
 def test_layers_are_the_maps_and_their_difference(tmp_path, rng):
     out = carried_out(tmp_path, source(rng))
     channels = OpenEXR.File(str(out / "edited_layers.exr"), separate_channels=True).channels()
@@ -120,7 +93,6 @@ def test_layers_are_the_maps_and_their_difference(tmp_path, rng):
     np.testing.assert_array_equal(planes["influence.Y"], influence[..., 0])
 
 
-@pytest.mark.slow
 def test_strokes_are_carried_out_and_what_cannot_be_had_is_told(tmp_path, rng, capsys):
     target = {"kind": "strokes", "strokes": [STROKE]}
     out = carried_out(tmp_path, source(rng), target=target)
@@ -135,7 +107,6 @@ def test_strokes_are_carried_out_and_what_cannot_be_had_is_told(tmp_path, rng, c
     np.testing.assert_allclose(wanted[8:10, 10:14], 0.5 * initial[8:10, 10:14], rtol=1e-5)
 
 
-@pytest.mark.slow
 def test_less_than_half_within_reach_is_a_warning(tmp_path, rng, capsys):
     """A chequered patch in the middle of a matte ball: no light does that."""
     strokes = [

@@ -1,7 +1,6 @@
 """Several views of a scene, which one map explains."""
 
 import dataclasses
-import signal
 
 import mitsuba as mi
 import numpy as np
@@ -42,15 +41,12 @@ def two(tmp_path):
 
 def settings_of(two, **tables):
     given = {
-        "preset": "draft",
         "input": {"envmap": "sunsky", "width": 64},
         "scene": {"file": str(two), "width": 40, "sensors": "all"},
         "target": {"rotate_degrees": 120.0},
         "representation": {"turn": False},
     }
-    for table, keys in tables.items():
-        given[table] = given.get(table, {}) | keys
-    return config.from_dict(given, two.parent)
+    return config.from_dict({"preset": "draft"} | runs.merged(given, tables), two.parent)
 
 
 # ---- the scene ---------------------------------------------------------------------------------------------
@@ -233,14 +229,8 @@ def test_an_interrupted_edit_of_two_views_goes_on_as_if_it_were_not(two, monkeyp
     assert whole.metrics["render"]["psnr"] > whole.metrics["initial"]["psnr"]
     folder = two.parent / "run"
     folder.mkdir()
-    stages = []
-
-    def progress(done, total, text):
-        if stages[-1] == "editing":
-            signal.raise_signal(signal.SIGINT)
-
     with pytest.raises(Interrupted):
-        pipeline.run(settings, folder=folder, watch=pipeline.Watch(stages.append, progress))
+        pipeline.run(settings, folder=folder, watch=runs.interrupting())
     found = pipeline.run(settings, folder=folder, resume=True)
     np.testing.assert_array_equal(found.envmap, whole.envmap)
     one = dataclasses.replace(settings, scene=dataclasses.replace(settings.scene, sensors=(0,)))

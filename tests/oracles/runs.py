@@ -3,13 +3,15 @@
 import contextlib
 import csv
 import json
+import signal
 
 import mitsuba as mi
 import numpy as np
 import pytest
 
-from envedit import config
+from envedit import config, inputs, pipeline
 from envedit.cli import doctor, run
+from envedit.export import file_resolution
 from envedit.images import images
 from tests.oracles.builders import BALL, LIGHT, SENSOR, sky, write_scene
 
@@ -35,6 +37,22 @@ SKY = """<default name="map" value="none.exr"/>
     <emitter type="envmap"><string name="filename" value="$map"/></emitter>"""
 
 
+def merged(*tables):
+    """Return tables whose later keys go before earlier ones."""
+    found = {}
+    for one in tables:
+        for name, keys in one.items():
+            found[name] = found.get(name, {}) | keys
+    return found
+
+
+def as_toml(tables):
+    lines = []
+    for table, keys in tables.items():
+        lines += [f"[{table}]", *(f"{key} = {config.quote(value)}" for key, value in keys.items())]
+    return "\n".join(lines)
+
+
 def world(folder, rng, **changes):
     """Write a map, a scene and a configuration of a tiny run; returns the configuration's path."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -42,11 +60,7 @@ def world(folder, rng, **changes):
         images.write_exr(folder / "map.exr", sunny(rng))
     write_scene(folder, SENSOR, BALL, SKY, name="scene.xml")
     given = {"input": {"envmap": "map.exr"}, "scene": {"file": "scene.xml"}}
-    lines = []
-    for table in TINY.keys() | changes.keys():
-        keys = TINY.get(table, {}) | given.get(table, {}) | changes.get(table, {})
-        lines += [f"[{table}]", *(f"{key} = {config.quote(value)}" for key, value in keys.items())]
-    (folder / "c.toml").write_text("\n".join(lines), encoding="utf-8")
+    (folder / "c.toml").write_text(as_toml(merged(TINY, given, changes)), encoding="utf-8")
     return folder / "c.toml"
 
 
@@ -129,19 +143,41 @@ def settings_of(folder, picture, **tables):
     """Return the configuration of a tiny run on a map, which is written; keys by table."""
     images.write_exr(folder / "map.exr", picture)
     write_scene(folder, SENSOR, BALL, LIGHT, name="scene.xml")
-    given = {
-        "input": {"envmap": "map.exr", "width": WIDTH, "rows": "upper"},
-        "scene": {"file": "scene.xml", "width": 24},
-        "target": {"spp": 16},
-        "representation": {"hidden": 16, "depth": 1, "cycles": 4, "turn": False},  # of the default kind
-        "fit": {"epochs": 4},
-        "optimizer": {"iterations": 20},
-        "renderer": {"spp": 32, "max_depth": 3},
-        "output": {"spp": 16},
-    }
-    for table, keys in tables.items():
-        given[table] = given.get(table, {}) | keys
-    return config.from_dict(given, folder)
+    files = {"input": {"envmap": "map.exr"}, "scene": {"file": "scene.xml"}, "optimizer": {"iterations": 20}}
+    return config.from_dict(merged(TINY, files, tables), folder)
+
+
+DARKER = {
+    "target": {
+        "kind": "strokes",
+        "strokes": [{"type": "shadow", "rectangle": [0.0, 0.0, 1.0, 1.0], "amount": 0.5}],
+    },
+    "renderer": {"spp": 4, "max_depth": 2},
+    "optimizer": {"iterations": 3},
+}
+"""Tables of an edit that asks for half the light."""
+
+
+def at_both_resolutions(folder, given, **tables):
+    """Edit the analytic sky at half its file's size; returns its map, settings, result, and the full map."""
+    wide = inputs.read_map(config.Input(envmap="sunsky", width=128), None, 128).radiance
+    images.write_exr(folder / "sky.exr", wide, {})
+    of_map = {"envmap": "sky.exr", "width": 64} | given
+    small = {"input": of_map, "scene": {"width": 8}, "output": {"spp": 4}}
+    settings = config.from_dict(small | tables, folder)
+    result = pipeline.run(settings)
+    return wide, settings, result, file_resolution.at_full_resolution(settings, result)
+
+
+def interrupting(stage="editing", step=None):
+    """Return a Watch that sends Ctrl-C with each progress of a stage, or after one step of it."""
+    stages = []
+
+    def progress(done, total, text):
+        if stages[-1] == stage and step in (None, done):
+            signal.raise_signal(signal.SIGINT)
+
+    return pipeline.Watch(stages.append, progress)
 
 
 def smooth(rng):

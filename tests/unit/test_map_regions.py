@@ -5,13 +5,13 @@ import sys
 import numpy as np
 import pytest
 
-from envedit import config, inputs, pipeline
+from envedit import config
 from envedit.core import latlong
 from envedit.core.errors import ConfigError, MachineError
-from envedit.export import file_resolution
-from envedit.images import images, map_regions
+from envedit.images import map_regions
 from envedit.representations.layers.oriented import oriented, oriented_share
 from tests.oracles.devices import on_cpu
+from tests.oracles.runs import DARKER, at_both_resolutions
 
 SHAPE = 64, 128
 WHOLE = [[0.0, -90.0], [360.0, -90.0], [360.0, 90.0], [0.0, 90.0]]
@@ -122,44 +122,12 @@ def test_without_opencv_the_extra_is_named(monkeypatch):
 @pytest.mark.parametrize(("kind", "tilt"), [("layers", 20), ("pixels", 0)])
 def test_what_is_kept_has_the_bits_of_the_input_at_both_resolutions(tmp_path, kind, tilt):
     """Under a target that asks for half the light, all but the region with the sun gets darker."""
-    wide = inputs.read_map(config.Input(envmap="sunsky", width=128), None, 128).radiance
-    images.write_exr(tmp_path / "sky.exr", wide, {})
-    text = f"""
-    [input]
-    envmap = "sky.exr"
-    width = 64
-    rotate_degrees = 90
-    tilt_degrees = {tilt}
-    [[input.regions]]
-    action = "keep"
-    points = [[90, 35]]
-    radius = 30
-    [[input.regions]]
-    action = "scale"
-    points = [[270, 35]]
-    radius = 20
-    factor = [2, 2, 2]
-    [scene]
-    width = 8
-    [target]
-    kind = "strokes"
-    [[target.strokes]]
-    type = "shadow"
-    rectangle = [0.0, 0.0, 1.0, 1.0]
-    amount = 0.5
-    [representation]
-    kind = "{kind}"
-    [renderer]
-    spp = 4
-    max_depth = 2
-    [optimizer]
-    iterations = 3
-    [output]
-    spp = 4
-    """
-    settings = config.loads(text, tmp_path)
-    result = pipeline.run(settings)
-    full = file_resolution.at_full_resolution(settings, result)
+    keep = {"action": "keep", "points": [[90, 35]], "radius": 30}
+    scale = {"action": "scale", "points": [[270, 35]], "radius": 20, "factor": [2, 2, 2]}
+    asked = {"rotate_degrees": 90, "tilt_degrees": tilt, "regions": [keep, scale]}
+    wide, settings, result, full = at_both_resolutions(
+        tmp_path, asked, representation={"kind": kind}, **DARKER
+    )
     regions, orientation = settings.input.regions, settings.input.orientation
     given = oriented(map_regions.changed(wide, regions), orientation)
     for edited, before in ((result.envmap, result.maps["initial"]), (full, given)):

@@ -3,13 +3,12 @@
 import numpy as np
 import pytest
 
-from envedit import config, inputs, pipeline
+from envedit import config, inputs
 from envedit.config import light_schema
 from envedit.core import latlong
 from envedit.core.color import LUMINANCE
 from envedit.core.errors import ConfigError, InputError
 from envedit.core.rotations import Orientation
-from envedit.export import file_resolution
 from envedit.images import images
 from envedit.maps.adjusted import Adjustments, adjusted
 from envedit.representations.layers.oriented import oriented
@@ -22,17 +21,13 @@ from envedit.representations.layers.placed_lights import (
     profile,
 )
 from tests.oracles.devices import on_cpu
+from tests.oracles.maps import flux
+from tests.oracles.runs import DARKER, at_both_resolutions
 
 
 @pytest.fixture(scope="module")
 def sky():
     return inputs.read_map(config.Input(envmap="sunsky", width=64), None, 64).radiance
-
-
-def flux(envmap, mask=None):
-    """Integrate a map over the solid angles that Mitsuba looks up, (3,)."""
-    omega = latlong.lookup_solid_angles(*envmap.shape[:2])[:, None, None]
-    return (np.float64(envmap) * omega).sum(axis=(0, 1))
 
 
 def test_directions_and_angles_are_inverse():
@@ -211,37 +206,12 @@ def test_keys_that_cannot_be_are_named():
 @pytest.mark.slow
 def test_the_full_map_has_the_same_lights(tmp_path):
     """The map's own resolution against the working one, without a target."""
-    wide = inputs.read_map(config.Input(envmap="sunsky", width=128), None, 128).radiance
-    images.write_exr(tmp_path / "sky.exr", wide, {})
-    text = """
-    [input]
-    envmap = "sky.exr"
-    width = 64
-    rotate_degrees = 90
-    tilt_degrees = 12
-    horizon_degrees = -7
-    [[input.lights]]
-    light = 1
-    azimuth = 300
-    elevation = 40
-    [[input.lights]]
-    azimuth = 30
-    elevation = 20
-    flux = [0.3, 0.2, 0.1]
-    size = 12
-    shape = "strip"
-    softness = 0.5
-    rotation = 30
-    [scene]
-    width = 8
-    [target]
-    kind = "none"
-    [output]
-    spp = 4
-    """
-    settings = config.loads(text, tmp_path)
-    result = pipeline.run(settings)
-    full = file_resolution.at_full_resolution(settings, result)
+    moved = {"light": 1, "azimuth": 300, "elevation": 40}
+    strip = {"azimuth": 30, "elevation": 20, "flux": [0.3, 0.2, 0.1], "size": 12, "shape": "strip"}
+    strip |= {"softness": 0.5, "rotation": 30}
+    rotated = {"rotate_degrees": 90, "tilt_degrees": 12, "horizon_degrees": -7}
+    asked = rotated | {"lights": [moved, strip]}
+    _, _, result, full = at_both_resolutions(tmp_path, asked, target={"kind": "none"})
     assert full.shape == (64, 128, 3)
     small = latlong.resize(full, 32, 64)
     assert np.allclose(flux(full), flux(result.envmap), rtol=0.05)
@@ -264,37 +234,9 @@ def test_a_muted_light_is_off_and_keeps_its_flux(sky):
 @pytest.mark.parametrize(("tilt", "tolerance"), [(0, 1e-3), (12, 5e-3)])
 def test_a_locked_light_is_left_by_the_edit_at_both_resolutions(tilt, tolerance, tmp_path):
     """Under a target that asks for half the light, all but the locked sun gets darker."""
-    wide = inputs.read_map(config.Input(envmap="sunsky", width=128), None, 128).radiance
-    images.write_exr(tmp_path / "sky.exr", wide, {})
-    text = """
-    [input]
-    envmap = "sky.exr"
-    width = 64
-    rotate_degrees = 90
-    tilt_degrees = TILT
-    [[input.lights]]
-    light = 1
-    name = "key"
-    locked = true
-    [scene]
-    width = 8
-    [target]
-    kind = "strokes"
-    [[target.strokes]]
-    type = "shadow"
-    rectangle = [0.0, 0.0, 1.0, 1.0]
-    amount = 0.5
-    [renderer]
-    spp = 4
-    max_depth = 2
-    [optimizer]
-    iterations = 3
-    [output]
-    spp = 4
-    """
-    settings = config.loads(text.replace("TILT", str(tilt)), tmp_path)
-    result = pipeline.run(settings)
-    full = file_resolution.at_full_resolution(settings, result)
+    key = {"light": 1, "name": "key", "locked": True}
+    asked = {"rotate_degrees": 90, "tilt_degrees": tilt, "lights": [key]}
+    wide, _, result, full = at_both_resolutions(tmp_path, asked, **DARKER)
     rotated = oriented(wide, Orientation(90, tilt))
     for edited, before in ((result.envmap, result.maps["initial"]), (full, rotated)):
         sun = before.mean(axis=2) > 0.5 * before.mean(axis=2).max()

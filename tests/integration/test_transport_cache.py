@@ -66,18 +66,6 @@ def test_a_second_build_traces_nothing_and_gives_the_same_bits(lamp, tmp_path, r
 
 
 @pytest.mark.slow
-def test_exact_columns_beside_a_recording_from_disk_are_the_same(lit, tmp_path, rng):
-    sun = np.full((8, 16, 3), 0.1, np.float32)
-    sun[2, 5] = 500
-    made = []
-    for t in (build(tmp_path, lit), build(tmp_path, lit)):
-        t.resolve(sun)
-        assert len(t.columns)
-        made.append((t.columns.tolist(), t.apply(mi.TensorXf(sun)).numpy().tobytes()))
-    assert made[0] == made[1]
-
-
-@pytest.mark.slow
 def test_what_was_lost_is_told_from_disk_as_well(lit, tmp_path, monkeypatch):
     real = recording.contributions
 
@@ -165,19 +153,6 @@ def test_a_later_version_records_anew(lit, tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_damaged_files_are_traced_again(lit, tmp_path, rng):
-    first = build(tmp_path, lit)
-    state = rng.bit_generator.state
-    made = pictures(first, rng)
-    for path in (tmp_path / "cache").iterdir():
-        path.write_bytes(path.read_bytes()[:-100])
-    again = build(tmp_path, lit)
-    rng.bit_generator.state = state
-    assert not again.cached and pictures(again, rng) == made
-    assert build(tmp_path, lit).cached
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "change"),
     [
@@ -211,14 +186,6 @@ def test_recordings_of_a_refresh_are_not_kept(lit, tmp_path, rng):
     made = [t.render(image, 1).numpy().tobytes() for t in (first, second)]
     assert made[0] == made[1] != build(tmp_path, lit).render(image, 0).numpy().tobytes()
     assert sorted(path.name for path in (tmp_path / "cache").iterdir()) == kept
-
-
-@pytest.mark.slow
-def test_without_a_folder_nothing_is_kept(lit, tmp_path):
-    before = set(tmp_path.rglob("*"))
-    for _ in range(2):
-        assert not LightTransport.build(lit, 8, 16, spp=4).cached
-    assert set(tmp_path.rglob("*")) == before
 
 
 @pytest.mark.slow

@@ -12,6 +12,8 @@ from envedit.images import images
 from experiments.divergence import experiment as divergence
 from experiments.harness import Case, Done, table
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def small(monkeypatch):
@@ -24,7 +26,6 @@ def small(monkeypatch):
     return config.from_dict(tables)
 
 
-@pytest.mark.slow
 def test_transport_has_no_noise_and_path_tracing_has(small, tmp_path, monkeypatch):
     done = []
     for name, how in {"traced": {"spp": 1, "least": 1.05}, "stored": {"spp": 0}}.items():
@@ -49,7 +50,6 @@ def test_transport_has_no_noise_and_path_tracing_has(small, tmp_path, monkeypatc
     assert drawn.stat().st_size > 1000
 
 
-@pytest.mark.slow
 def test_the_loss_of_a_noisy_rendering_is_the_judged_loss_and_its_variance(small):
     """Of the true map the first is 0, so that the loss of a step is its variance alone."""
     scene = divergence.inputs.load_scene(small.scene)

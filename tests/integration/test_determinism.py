@@ -14,7 +14,7 @@ import pytest
 from tests.oracles import ROOT
 from tests.oracles.runs import call, changed, differing, pixels, world
 
-pytestmark = pytest.mark.usefixtures("isolated", "own_core")
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("isolated", "own_core")]
 
 
 @pytest.fixture
@@ -48,7 +48,6 @@ def configured(folder, rng, kind, renderer="transport"):
 CASES = [("transport", "layers"), ("transport", "siren"), ("path", "siren")]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("renderer", "kind"), CASES)
 def test_the_same_files_on_any_number_of_threads(kind, renderer, tmp_path, rng, carried_out):
     path = configured(tmp_path, rng, kind, renderer)
@@ -58,7 +57,6 @@ def test_the_same_files_on_any_number_of_threads(kind, renderer, tmp_path, rng, 
     assert pixels(one / "edited.exr").tobytes() != pixels(tmp_path / "map.exr").tobytes()
 
 
-@pytest.mark.slow
 def test_a_wide_pixel_filter_and_odd_numbers_of_samples_give_the_same_files(tmp_path, rng, carried_out):
     path = configured(tmp_path, rng, "log-pixels")
     scene = tmp_path / "scene.xml"
@@ -68,7 +66,6 @@ def test_a_wide_pixel_filter_and_odd_numbers_of_samples_give_the_same_files(tmp_
     assert differing(one, two) == set()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("renderer", ["transport", "path"])
 def test_another_seed_gives_other_bytes(renderer, tmp_path, rng, carried_out):
     """So that the same bytes mean something: what is compared depends on the samples."""
@@ -78,7 +75,6 @@ def test_another_seed_gives_other_bytes(renderer, tmp_path, rng, carried_out):
     assert error(one, other) > 1e-4
 
 
-@pytest.mark.slow
 def test_another_process_gives_the_same_files(tmp_path, rng, carried_out):
     """With another order of sets and dicts of strings, and with as many threads as there are cores."""
     path = configured(tmp_path, rng, "layers")

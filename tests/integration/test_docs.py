@@ -18,6 +18,8 @@ import envedit
 from envedit.cli.main import COMMANDS
 from tests.oracles import ROOT
 
+pytestmark = pytest.mark.slow
+
 DOCS = ROOT / "docs"
 PAGES = [
     ROOT / "README.md",
@@ -29,7 +31,6 @@ ELSEWHERE = ("build", "pytest", "sphinx", "venv", "pip")
 """Programs of others that are run as ``python -m``."""
 
 
-@pytest.mark.slow
 def test_painting_in_python(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     found = runpy.run_path(str(DOCS / "paint_in_python.py"))
@@ -39,7 +40,6 @@ def test_painting_in_python(tmp_path, monkeypatch, capsys):
     assert "is feasible" in capsys.readouterr().out
 
 
-@pytest.mark.slow
 def test_the_site_builds_offline_without_a_warning(tmp_path):
     for package in ("sphinx", "myst_nb", "furo"):
         pytest.importorskip(package, reason="the extra envedit[docs] is not installed")
@@ -53,7 +53,6 @@ def test_the_site_builds_offline_without_a_warning(tmp_path):
         assert not loaded, f"{page}: {loaded[0]}"
 
 
-@pytest.mark.slow
 def test_the_notebook_runs(tmp_path):
     for package in ("jupytext", "ipykernel", "nbconvert"):
         pytest.importorskip(package, reason="the extra envedit[docs] is not installed")
@@ -73,7 +72,6 @@ def test_the_notebook_runs(tmp_path):
         assert re.search(line, printed), printed
 
 
-@pytest.mark.slow
 def test_the_citation_names_the_version():
     cited = re.search(r"^version: (.*)$", (ROOT / "CITATION.cff").read_text(), re.M)
     assert cited and cited[1] == envedit.__version__
@@ -125,7 +123,6 @@ def parse(command, monkeypatch, capsys):
         assert not {option for option in options if option not in said.out}, command
 
 
-@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.* found in sys.modules after import:RuntimeWarning")
 @pytest.mark.parametrize("page", sorted({page for page, _ in commands()}))
 def test_every_command_in_the_pages_is_understood(page, monkeypatch, capsys):
@@ -142,7 +139,6 @@ def test_every_command_in_the_pages_is_understood(page, monkeypatch, capsys):
         parse(command, monkeypatch, capsys)
 
 
-@pytest.mark.slow
 def test_commands_are_found_and_a_wrong_one_is_noticed(monkeypatch, capsys):
     found = [command for _, command in commands()]
     assert len(set(found)) > 40 and {c.split()[1] for c in found if c.startswith("envedit ")} >= set(COMMANDS)

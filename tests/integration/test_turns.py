@@ -10,7 +10,7 @@ from envedit.images import analytic_sky, images
 from tests.oracles import runs
 from tests.oracles.builders import write_scene
 
-pytestmark = pytest.mark.usefixtures("own_core")
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("own_core")]
 
 CLOUDS = 12
 TORUS = """<sensor type="perspective"><float name="fov" value="35"/>
@@ -58,7 +58,6 @@ def write_torus(path, around=48, across=24, radius=0.4):
     path.write_text("\n".join([*header, *lines]) + "\n")
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("degrees", [75.0, 250.0])
 def test_a_turn_seen_through_rough_glass_is_found_and_not_spoiled(degrees, rng, tmp_path):
     """The target's noise is larger than what most of its pixels say of the turn."""
@@ -73,7 +72,6 @@ def test_a_turn_seen_through_rough_glass_is_found_and_not_spoiled(degrees, rng, 
     assert found["envmap"]["psnr"] > found["initial_envmap"]["psnr"] + 10
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("isolated")
 def test_turns_of_one_run_after_another_add_up(rng, tmp_path):
     """Each run edits the map and the scene that the run before has written."""

@@ -132,20 +132,22 @@ def solve(
     if after_step and (known or not iterations):
         after_step(run, point)
     point = _descended(problem, run, point, sigma, min(iterations, run.most), after_step)
-    normal, note, whole = _normal(problem, run, point, sigma), "", run
+    normal = problem.curvature(point, run.start, sigma)
+    note = ""
+    whole = run
     if sparing and run.history:
         before = replace(run, state=start, start=start)
         first = problem.evaluate(start, resolve=False)
-        loss = _unlikeliness(problem, run, point, sigma) + 2 * normal.determined
+        loss = problem.unlikeliness(point, run.start, sigma) + 2 * normal.determined
         noise = problem.likelihood.noise(point.residual, sigma)
         near = problem.likelihood.noise(first.residual, sigma) < COMPARED_NOISE_RATIO * noise
-        if _unlikeliness(problem, before, first, sigma) <= loss:
+        if problem.unlikeliness(first, start, sigma) <= loss:
             note = "kept the initialisation: the better match of the rendering does not justify "
             note += f"{normal.determined:.0f} parameters (Akaike criterion)"
         elif judge is not None and near and KEPT_ERROR_SHARE * judge(first.edited) <= judge(point.edited):
             note = "kept the initialisation: path-traced, it is as close to the target as the solution"
         if note:
-            run, normal = before, _normal(problem, before, first, sigma)
+            run, normal = before, problem.curvature(first, start, sigma)
     return Solution(
         problem.solution_params(run.state), run.history, whole, problem.posterior(run.state, normal), note
     )
@@ -157,16 +159,6 @@ def descended(problem: Problem, run: Run, point: Point, sigma: float = SIGMA, st
     The run goes along; it may be finished before. Other parameters are those of :func:`solve`.
     """
     return _descended(problem, run, point, sigma, len(run.history) + steps, None)
-
-
-def _normal(problem, run, point, sigma):
-    return problem.normal(point, run.start, problem.likelihood.noise(point.residual, sigma), descent=False)
-
-
-def _unlikeliness(problem, run, point, sigma):
-    """Return -2 log posterior at the noise that the residual shows, but for a constant."""
-    noise = problem.likelihood.noise(point.residual, sigma)
-    return problem.loss(point, run.start, noise) + 6 * problem.likelihood.independent * float(np.log(noise))
 
 
 def _descended(problem, run, point, sigma, most, after_step):

@@ -10,6 +10,7 @@ for the best strength of the light (Tipping and Faul 2003).
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -85,6 +86,16 @@ def probed(
     return texels, pictures
 
 
+def most_promising(directions: np.ndarray, promise: np.ndarray) -> Iterator[int]:
+    """Yield :data:`PLACES_REFINED` cells (n,), apart, that promise most; none where that is not finite."""
+    for _ in range(PLACES_REFINED):
+        at = int(np.argmax(promise))
+        if not np.isfinite(promise[at]):
+            return
+        yield at
+        promise = np.where(directions @ directions[at] > PLACES_APART_COSINE, -np.inf, promise)
+
+
 def is_apart(direction: np.ndarray, others: list[np.ndarray]) -> bool:
     """Whether a direction is another explanation than all others."""
     return all(direction @ other <= PLACES_APART_COSINE for other in others)
@@ -117,15 +128,11 @@ class Places:
         flux = flux / scale  # of any strength, in single precision
         strengths, falls = self._model.of_cells(flux)
         places_refined: list[Place] = []
-        for _ in range(PLACES_REFINED):
-            at = int(np.argmax(falls))
-            if not falls[at] > 0:
-                break
+        for at in most_promising(directions, np.where(falls > 0, falls, -np.inf)):
             place = Place(directions[at], np.full(3, strengths[at]), float(falls[at]))
             place = self._refined(place, flux)
             if is_apart(place.direction, [other.direction for other in places_refined]):
                 places_refined.append(replace(place, factor=place.factor / scale))
-            falls = np.where(directions @ directions[at] > PLACES_APART_COSINE, 0, falls)
         return places_refined
 
     def _refined(self, place, flux):

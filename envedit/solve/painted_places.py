@@ -16,7 +16,7 @@ from envedit.core.arrays import flat, tensor
 from envedit.core.rotations import rotation_vector
 from envedit.losses import display_curve
 from envedit.representations.layers.lights import LOBE_DEGREES
-from envedit.solve.light_places import PLACES_APART_COSINE, PLACES_REFINED, is_apart, lit_ground, probed
+from envedit.solve.light_places import PLACES_APART_COSINE, is_apart, lit_ground, most_promising, probed
 from envedit.solve.likelihood import Likelihood, of_mean
 from envedit.solve.map_problem import Problem
 
@@ -71,11 +71,7 @@ def best(problem: Problem, state: dict, k: int, sigma: float, away: np.ndarray |
         unlikeliness = np.where(directions @ away > PLACES_APART_COSINE, np.inf, unlikeliness)
     places: list[Place] = []
     texels: list[np.ndarray] = []
-    for _ in range(PLACES_REFINED):
-        at = int(np.argmin(unlikeliness))
-        if not np.isfinite(unlikeliness[at]):
-            break
-        unlikeliness = np.where(directions @ directions[at] > PLACES_APART_COSINE, np.inf, unlikeliness)
+    for at in most_promising(directions, -unlikeliness):
         texel = trial.texel(directions[at])
         if is_apart(texel.direction, texels):
             texels.append(texel.direction)

@@ -179,11 +179,8 @@ def score(problem: Problem, run: gauss_newton.Run, point: Point, sigma: float) -
     """Return -2 log evidence at a point, but for a constant; inf where it is not finite."""
     if point.residual is None:
         return np.inf
-    # ---- -2 log of likelihood and prior, at the most likely noise
-    noise = problem.likelihood.noise(point.residual, sigma)
-    unlikeliness = problem.likelihood.at_best(point.residual, sigma) + problem.penalty(run.state, run.start)
     # ---- log det H - log det K
-    normal = problem.normal(point, run.start, noise, descent=False)
+    normal = problem.curvature(point, run.start, sigma)
     _, posterior = np.linalg.slogdet(normal.hessian)
     _, prior = np.linalg.slogdet(normal.precision)
     # ---- What lights cost
@@ -191,7 +188,7 @@ def score(problem: Problem, run: gauss_newton.Run, point: Point, sigma: float) -
     cost += of_place(problem) * len(_replaced(problem, run))
     if problem.likelihood.robust:
         cost += FADED_LIGHT_COST * len(_faded(problem, run.state))
-    evidence = float(unlikeliness + posterior - prior + cost)
+    evidence = float(problem.unlikeliness(point, run.start, sigma) + posterior - prior + cost)
     return evidence if np.isfinite(evidence) else np.inf
 
 

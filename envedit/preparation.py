@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -20,15 +21,16 @@ from envedit.core.errors import NumericalError
 from envedit.core.resampling import fit as fitted
 from envedit.core.rows import Rows
 from envedit.core.seeds import Seeds
+from envedit.core.types import Params
 from envedit.images import map_regions
 from envedit.losses.perceptual import distances
 from envedit.representations.layers import below_horizon
 from envedit.representations.siren import fit
 from envedit.scene.renderings import rendered
 from envedit.scene.scene import Scene
-from envedit.solve import initialization, turning
-from envedit.solve.edit_job import Job
-from envedit.solve.edit_state import Watch
+from envedit.solve import adam_loop, adam_solver, initialization, turning
+from envedit.solve.edit_state import EditState, Watch
+from envedit.solve.layers_solver import LayersSolver
 from envedit.solve.search import STRONG_EVIDENCE
 from envedit.targets.target import Target
 
@@ -43,6 +45,25 @@ there, and a small change of the light is not. 256 residuals, as in :data:`.map_
 TURN_PATHS = 2**20
 """Paths of a rendering that is compared to find a turn, all pixels together, up to a factor of two; at most
 as many as the target's."""
+
+
+@dataclass
+class Job(EditState):
+    """One edit in progress, with its two solvers: Gauss-Newton for layers through T, Adam for all else."""
+
+    @cached_property
+    def layers(self) -> LayersSolver:
+        """Solver of layers; also finds where Adam starts, if their detail is left to it."""
+        return LayersSolver(self)
+
+    def optimise(self, params: Params, crop: np.ndarray, resume: bool) -> tuple[Params, adam_loop.State]:
+        """Optimise from the start, or from the checkpoint; returns parameters and state.
+
+        Parameters and errors are those of :func:`.adam_solver.optimise` and :meth:`.LayersSolver.optimise`.
+        """
+        if self.newton:
+            return self.layers.optimise(params, resume)
+        return adam_solver.optimise(self, params, crop, resume)
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,17 @@ from dataclasses import dataclass
 from numbers import Integral, Real
 from typing import Any
 
-from envedit.config.validators import Check, Choice, Integer, Number, Numbers, Schema, String, WantedError
+from envedit.config.validators import (
+    Check,
+    Choice,
+    Either,
+    Integer,
+    Number,
+    Pair,
+    Schema,
+    String,
+    WantedError,
+)
 
 Ramp = float | tuple[float, float]
 """A constant weight, or the two ends of a geometric ramp."""
@@ -16,107 +26,48 @@ MOST_DIM = 16384
 
 
 @dataclass(frozen=True)
-class Kelvin(Check):
+class Kelvin(Either):
     """A colour temperature for which there are chromaticities, or 0."""
 
-    low: float = 2000.0
-    high: float = 25000.0
     kind = "number"
-
-    def _take(self, value: Any) -> float:
-        try:
-            found = Number(0, self.high)(value)
-        except WantedError:
-            found = -1.0
-        if found and not self.low <= found <= self.high:
-            raise WantedError(str(self))
-        return found
-
-    def __str__(self) -> str:
-        return f"0, or kelvin from {self.low:g} to {self.high:g}"
-
-    @property
-    def range(self) -> str:
-        """Least and most."""
-        return f"0, or {self.low:g} to {self.high:g}"
-
-    def _schema(self) -> Schema:
-        return {"anyOf": [{"const": 0}, Number(self.low, self.high).schema()]}
+    range = "0, or 2000 to 25000"
+    words = "0, or kelvin from 2000 to 25000"
+    checks = Number(0, 0), Number(2000, 25000)
 
 
 @dataclass(frozen=True)
-class Weight(Check):
+class Weight(Either):
     """A constant weight, or the two ends of a geometric ramp."""
 
     kind = "number or list"
     range = "at least 0; or [start, end], both above 0"
-
-    def _take(self, value: Any) -> Ramp:
-        end = Number(0, positive=True)
-        try:
-            if isinstance(value, list | tuple):
-                first, last = value
-                return end(first), end(last)
-            return Number(0)(value)
-        except (ValueError, WantedError):
-            raise WantedError(str(self)) from None
-
-    def __str__(self) -> str:
-        return "a number of at least 0, or [start, end], both above 0"
-
-    def _schema(self) -> Schema:
-        end = Number(0, positive=True)
-        return {"anyOf": [Number(0).schema(), Numbers(end, end).schema()]}
+    words = "a number of at least 0, or [start, end], both above 0"
+    checks = Number(0), Pair(Number(0, positive=True))
 
 
 @dataclass(frozen=True)
-class RowRange(Check):
+class RowRange(Either):
     """The rows that an edit may change: a name, or the first and last of them."""
 
     kind = "string or list"
     range = '"upper", "all" or [first, last]'
+    words = '"upper", "all" or [first, last], rows from 0 at the zenith, last included'
+    checks = Choice("upper", "all"), Pair(Integer(0, MOST_DIM))
 
     def _take(self, value: Any) -> str | tuple[int, int]:
-        row = Integer(0, MOST_DIM)
-        try:
-            if isinstance(value, list | tuple):
-                first, last = map(row, value)
-                if first <= last:
-                    return first, last
-            elif isinstance(value, str):
-                return Choice("upper", "all")(value)
-        except (ValueError, WantedError):
-            pass
-        raise WantedError(str(self))
-
-    def __str__(self) -> str:
-        return '"upper", "all" or [first, last], rows from 0 at the zenith, last included'
-
-    def _schema(self) -> Schema:
-        row = Integer(0, MOST_DIM)
-        return {"anyOf": [Choice("upper", "all").schema(), Numbers(row, row).schema()]}
+        rows = super()._take(value)
+        if isinstance(rows, tuple) and rows[0] > rows[1]:
+            raise WantedError(self.words)
+        return rows
 
 
 @dataclass(frozen=True)
-class View(Check):
+class View(Either):
     """A view: the id of its sensor, or its index."""
 
     kind = "string or integer"
-
-    def _take(self, value: Any) -> int | str:
-        try:
-            check = String() if isinstance(value, str) else Integer(0, MOST_DIM)
-            if (found := check(value)) != "":
-                return found
-        except WantedError:
-            pass
-        raise WantedError(str(self))
-
-    def __str__(self) -> str:
-        return "the id of a sensor, or the index of a view from 0"
-
-    def _schema(self) -> Schema:
-        return {"anyOf": [{"type": "string", "minLength": 1}, Integer(0, MOST_DIM).schema()]}
+    words = "the id of a sensor, or the index of a view from 0"
+    checks = String(least=1), Integer(0, MOST_DIM)
 
 
 @dataclass(frozen=True)
@@ -149,6 +100,7 @@ class Parameters(Check):
     """A flat table of strings, numbers and booleans."""
 
     kind = "table"
+    range = "of strings, numbers and booleans"
 
     def _take(self, value: Any) -> dict[str, str | float | bool]:
         if not isinstance(value, dict) or any(isinstance(v, dict | list | tuple) for v in value.values()):
@@ -156,12 +108,7 @@ class Parameters(Check):
         return plain(value)
 
     def __str__(self) -> str:
-        return "a table of strings, numbers and booleans"
-
-    @property
-    def range(self) -> str:
-        """What its values are."""
-        return "of strings, numbers and booleans"
+        return f"a table {self.range}"
 
     def _schema(self) -> Schema:
         return {"type": "object", "additionalProperties": {"type": ["string", "number", "boolean"]}}

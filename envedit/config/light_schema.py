@@ -106,29 +106,27 @@ class LightList(Tables):
             )
         return found
 
-    def _entry(self, name: str, table: dict[str, Any]) -> dict[str, Any]:
-        return _light(name, table)
+    def _entry(self, name: str, light: dict[str, Any]) -> dict[str, Any]:
+        keys = OWN if "light" in light else ADDED
+        for unknown in (k for k in light if k not in keys):
+            hint = meant(str(unknown), keys)
+            hint = hint if hint.startswith("did") else f"known: {', '.join(dict.fromkeys(['light', *keys]))}"
+            raise ConfigError(f"{name}: has no key {show(unknown)}; {hint}")
+        found = {
+            key: named(f"{name}.{key}", check, light[key]) for key, check in keys.items() if key in light
+        }
+        if ("azimuth" in found) != ("elevation" in found):
+            raise ConfigError(f"{name}: got one of azimuth and elevation, expected both or none")
+        if "light" in light:
+            return {"flux": [1.0, 1.0, 1.0], "size": 1.0} | found
+        if (found.get("shape") == "image") != bool(found.get("image")):
+            raise ConfigError(f'{name}: got one of shape = "image" and image = FILE, expected both or none')
+        for key in ("azimuth", "flux"):
+            if key not in found:
+                raise ConfigError(f"{name}.{key}: got none, expected one: a light without `light` is added")
+        return {"size": SIZE} | found
 
     def _schema(self) -> Schema:
         keys = {key: {**(OWN | ADDED)[key].schema(), "description": MEANINGS[key]} for key in MEANINGS}
         both = {"azimuth": ["elevation"], "elevation": ["azimuth"]}
         return self._schema_of({"properties": keys, "dependencies": both})
-
-
-def _light(name: str, light: dict[str, Any]) -> dict[str, Any]:
-    keys = OWN if "light" in light else ADDED
-    for unknown in (k for k in light if k not in keys):
-        hint = meant(str(unknown), keys)
-        hint = hint if hint.startswith("did") else f"known: {', '.join(dict.fromkeys(['light', *keys]))}"
-        raise ConfigError(f"{name}: has no key {show(unknown)}; {hint}")
-    found = {key: named(f"{name}.{key}", check, light[key]) for key, check in keys.items() if key in light}
-    if ("azimuth" in found) != ("elevation" in found):
-        raise ConfigError(f"{name}: got one of azimuth and elevation, expected both or none")
-    if "light" in light:
-        return {"flux": [1.0, 1.0, 1.0], "size": 1.0} | found
-    if (found.get("shape") == "image") != bool(found.get("image")):
-        raise ConfigError(f'{name}: got one of shape = "image" and image = FILE, expected both or none')
-    for key in ("azimuth", "flux"):
-        if key not in found:
-            raise ConfigError(f"{name}.{key}: got none, expected one: a light without `light` is added")
-    return {"size": SIZE} | found

@@ -86,8 +86,20 @@ class RegionList(Tables):
     name = "input.regions"
     most = MOST_REGIONS
 
-    def _entry(self, name: str, table: dict[str, Any]) -> dict[str, Any]:
-        return _region(name, table)
+    def _entry(self, name: str, region: dict[str, Any]) -> dict[str, Any]:
+        for unknown in (key for key in region if key not in KEYS):
+            raise ConfigError(f"{name}: has no key {show(unknown)}; {meant(unknown, KEYS)}")
+        found = {
+            key: named(f"{name}.{key}", check, region[key]) for key, check in KEYS.items() if key in region
+        }
+        if "action" not in found:
+            raise ConfigError(f"{name}.action: got none, expected one of {', '.join(ACTIONS)}")
+        if ("points" in found) == ("polygon" in found):
+            given = "both" if "points" in found else "neither"
+            raise ConfigError(f"{name}: got {given} of points and polygon, expected one of them")
+        _require(name, "radius", found, needed="points" in found, where="with points")
+        _require(name, "factor", found, needed=found["action"] == "scale", where='where action is "scale"')
+        return {"softness": 0.0} | found
 
     def _schema(self) -> Schema:
         keys = {key: {**check.schema(), "description": MEANINGS[key]} for key, check in KEYS.items()}
@@ -95,20 +107,6 @@ class RegionList(Tables):
         brush = {"points": ["radius"], "radius": ["points"]}
         region = {"properties": keys, "required": ["action"], "oneOf": shape, "dependencies": brush}
         return self._schema_of(region)
-
-
-def _region(name: str, region: dict[str, Any]) -> dict[str, Any]:
-    for unknown in (key for key in region if key not in KEYS):
-        raise ConfigError(f"{name}: has no key {show(unknown)}; {meant(unknown, KEYS)}")
-    found = {key: named(f"{name}.{key}", check, region[key]) for key, check in KEYS.items() if key in region}
-    if "action" not in found:
-        raise ConfigError(f"{name}.action: got none, expected one of {', '.join(ACTIONS)}")
-    if ("points" in found) == ("polygon" in found):
-        given = "both" if "points" in found else "neither"
-        raise ConfigError(f"{name}: got {given} of points and polygon, expected one of them")
-    _require(name, "radius", found, needed="points" in found, where="with points")
-    _require(name, "factor", found, needed=found["action"] == "scale", where='where action is "scale"')
-    return {"softness": 0.0} | found
 
 
 def _require(name, key, found, needed, where):

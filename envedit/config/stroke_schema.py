@@ -178,8 +178,42 @@ class StrokeList(Tables):
 
     name = "target.strokes"
 
-    def _entry(self, name: str, table: dict[str, Any]) -> dict[str, Any]:
-        return _stroke(name, table)
+    def _entry(self, name: str, stroke: dict[str, Any]) -> dict[str, Any]:
+        if "type" not in stroke:
+            raise ConfigError(f"{name}.type: got none, expected one of {', '.join(STROKES)}")
+        kind = named(f"{name}.type", Choice(*STROKES), stroke["type"])
+        keys = STROKES[kind] | ANY_STROKE
+        known = ["type", *SHAPES, "width", "view", *keys]
+        for unknown in (k for k in stroke if k not in known):
+            raise ConfigError(f"{name}, type {kind}, has no key {show(unknown)}; {meant(unknown, known)}")
+
+        found: dict[str, Any] = {"type": kind}
+        shapes = [shape for shape in SHAPES if shape in stroke]
+        if len(shapes) > 1:
+            raise ConfigError(f"{name}: got {' and '.join(shapes)}, expected one shape")
+        if not shapes and kind not in WHOLE_IMAGE:
+            raise ConfigError(f"{name}: got no shape, expected one of {', '.join(SHAPES)} for type {kind}")
+        for shape in shapes:
+            check, place, value = SHAPES[shape], f"{name}.{shape}", stroke[shape]
+            if isinstance(check, Points) and isinstance(value, list | tuple):
+                for i, point in enumerate(value):
+                    named(f"{place}[{i}]", _POINT, point)
+            found[shape] = named(place, check, value)
+        if "points" in stroke:
+            if "width" not in stroke:
+                raise ConfigError(
+                    f"{name}.width: got none, expected the width of the brush, as points are given"
+                )
+            found["width"] = named(f"{name}.width", _LENGTH, stroke["width"])
+        elif "width" in stroke:
+            raise ConfigError(f"{name}.width: got {show(stroke['width'])}, expected none without points")
+        if "view" in stroke:
+            found["view"] = named(f"{name}.view", View(), stroke["view"])
+        for key, (default, check) in keys.items():
+            if key not in stroke and default is None:
+                raise ConfigError(f"{name}.{key}: got none, expected a number, as type is {kind}")
+            found[key] = named(f"{name}.{key}", check, stroke.get(key, default))
+        return found
 
     def _schema(self) -> Schema:
         properties: Schema = {}
@@ -197,40 +231,4 @@ def stroke_keys() -> dict[str, list[Check]]:
     for keys in (*STROKES.values(), ANY_STROKE):
         for key, (_, check) in keys.items():
             found.setdefault(key, []).append(check)
-    return found
-
-
-def _stroke(name: str, stroke: dict[str, Any]) -> dict[str, Any]:
-    if "type" not in stroke:
-        raise ConfigError(f"{name}.type: got none, expected one of {', '.join(STROKES)}")
-    kind = named(f"{name}.type", Choice(*STROKES), stroke["type"])
-    keys = STROKES[kind] | ANY_STROKE
-    known = ["type", *SHAPES, "width", "view", *keys]
-    for unknown in (k for k in stroke if k not in known):
-        raise ConfigError(f"{name}, type {kind}, has no key {show(unknown)}; {meant(unknown, known)}")
-
-    found: dict[str, Any] = {"type": kind}
-    shapes = [shape for shape in SHAPES if shape in stroke]
-    if len(shapes) > 1:
-        raise ConfigError(f"{name}: got {' and '.join(shapes)}, expected one shape")
-    if not shapes and kind not in WHOLE_IMAGE:
-        raise ConfigError(f"{name}: got no shape, expected one of {', '.join(SHAPES)} for type {kind}")
-    for shape in shapes:
-        check, place, value = SHAPES[shape], f"{name}.{shape}", stroke[shape]
-        if isinstance(check, Points) and isinstance(value, list | tuple):
-            for i, point in enumerate(value):
-                named(f"{place}[{i}]", _POINT, point)
-        found[shape] = named(place, check, value)
-    if "points" in stroke:
-        if "width" not in stroke:
-            raise ConfigError(f"{name}.width: got none, expected the width of the brush, as points are given")
-        found["width"] = named(f"{name}.width", _LENGTH, stroke["width"])
-    elif "width" in stroke:
-        raise ConfigError(f"{name}.width: got {show(stroke['width'])}, expected none without points")
-    if "view" in stroke:
-        found["view"] = named(f"{name}.view", View(), stroke["view"])
-    for key, (default, check) in keys.items():
-        if key not in stroke and default is None:
-            raise ConfigError(f"{name}.{key}: got none, expected a number, as type is {kind}")
-        found[key] = named(f"{name}.{key}", check, stroke.get(key, default))
     return found

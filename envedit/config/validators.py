@@ -11,6 +11,7 @@ precision, in which everything is computed.
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import math
 from abc import ABC, abstractmethod
@@ -103,14 +104,15 @@ class Tables(Check):
 
 @dataclass(frozen=True)
 class String(Check):
-    """Text or a path, as text."""
+    """Text or a path, as text of at least so many characters."""
 
+    least: int = 0
     kind = "string"
 
     def _take(self, value: Any) -> str:
         if isinstance(value, PathLike):
             value = fspath(value)
-        if not isinstance(value, str):
+        if not isinstance(value, str) or len(value) < self.least:
             raise WantedError(str(self))
         # A NUL cannot be in a path, a lone surrogate (an argument that is not UTF-8) cannot be written.
         if "\0" in value or any("\ud800" <= c <= "\udfff" for c in value):
@@ -121,7 +123,7 @@ class String(Check):
         return "a string"
 
     def _schema(self) -> Schema:
-        return {"type": "string"}
+        return {"type": "string"} | ({"minLength": self.least} if self.least else {})
 
 
 @dataclass(frozen=True)
@@ -278,7 +280,36 @@ class Numbers(Check):
         return {"type": "array", "items": items, "minItems": len(items), "maxItems": len(items)}
 
 
-# ---- what another check accepts, and more ------------------------------------------------------------------
+class Pair(Numbers):
+    """Two values of one check, as a tuple."""
+
+    def __init__(self, check: Check) -> None:
+        super().__init__(check, check)
+
+    def _take(self, value: Any) -> tuple[Any, ...]:
+        return tuple(super()._take(value))
+
+
+# ---- what other checks accept ------------------------------------------------------------------------------
+
+
+class Either(Check):
+    """What one of several checks accepts, in words of its own."""
+
+    checks: tuple[Check, ...]
+    words: str
+
+    def _take(self, value: Any) -> Any:
+        for check in self.checks:
+            with contextlib.suppress(WantedError):
+                return check(value)
+        raise WantedError(self.words)
+
+    def __str__(self) -> str:
+        return self.words
+
+    def _schema(self) -> Schema:
+        return {"anyOf": [check.schema() for check in self.checks]}
 
 
 @dataclass(frozen=True)

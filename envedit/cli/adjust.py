@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 
-from envedit.cli import map_command
+from envedit.cli import doctor, map_command
 from envedit.cli.map_command import number
 from envedit.cli.streams import steady
 from envedit.core.errors import ConfigError
@@ -80,7 +80,7 @@ def _adjust(arguments, console):
             raise ConfigError(f"--background: got {path}, where the map itself goes: give another name")
 
     # ---- The maps
-    map_command.select_variant()
+    doctor.select()
     input_map = map_command.read(arguments.map, arguments, console)
     radiance, notes = adjusted(map_file.radiance_of(input_map), how)
     for line in notes:
@@ -92,7 +92,6 @@ def _adjust(arguments, console):
         stored = map_file.as_stored(radiance, input_map)
         if arguments.program:
             stored = turned_for(arguments.program, stored)
-        for warning in map_file.write(file, stored, input_map):
-            console.warn(warning)
+        map_command.write(file, stored, input_map, console)
         console.say(str(file))
     console.facts |= {"files": {name: str(file) for name, file in files.items()}, "notes": notes}

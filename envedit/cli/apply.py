@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from envedit.cli import map_command
+from envedit.cli import doctor, map_command
 from envedit.cli.streams import steady
 from envedit.core.errors import ConfigError
 
@@ -40,7 +40,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _apply(arguments, console):
-    from envedit.maps import look_transfer, looks, map_file
+    from envedit.maps import look_transfer, looks
 
     # ---- What is asked
     names = [file for file in arguments.files if file.lower().endswith(LOOK)]
@@ -53,15 +53,14 @@ def _apply(arguments, console):
     start = selected[0] if len(selected) == 2 else None
 
     # ---- Map by map, each read once
-    map_command.select_variant()
+    doctor.select()
     console.facts["files"] = []
     for source, targets in zip(maps, files, strict=True):
         input_map = map_command.read(source, arguments, console)
         for amount, path in zip(amounts, targets, strict=True):
             edited = look_transfer.apply(input_map.radiance, selected[-1], amount, start)
             folder.mkdir(parents=True, exist_ok=True)
-            for warning in map_file.write(path, input_map.as_stored(edited), input_map):
-                console.warn(warning)
+            map_command.write(path, input_map.as_stored(edited), input_map, console)
             console.facts["files"].append({"map": source, "file": str(path), "amount": amount})
             console.say(f"{path}: {source} in the light of {names[-1]}, amount {amount:.3g}")
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from envedit.cli import map_command
+from envedit.cli import doctor, map_command
 from envedit.cli.streams import steady
 
 
@@ -38,7 +38,7 @@ def _blend(arguments, console):
 
     sources = [arguments.first, arguments.second]
     path = map_file.output_path(arguments.out, "blended", sources, arguments.overwrite)
-    map_command.select_variant()
+    doctor.select()
     first = map_command.read(arguments.first, arguments, console)
     second = map_command.read(arguments.second, arguments, console)
     alike = first.chromaticities == second.chromaticities and first.size == second.size
@@ -54,7 +54,6 @@ def _blend(arguments, console):
             other = latlong.resize(other, *first.stored.shape[:2])
         radiance, lights = blend(map_file.radiance_of(first), other, arguments.amount)
         values = map_file.as_stored(radiance, first)
-    for warning in map_file.write(path, values, first):
-        console.warn(warning)
+    map_command.write(path, values, first, console)
     console.facts |= {"files": {"map": str(path)}, "amount": arguments.amount, "lights": lights}
     console.say(f"{len(lights)} lights; {path}" if lights else str(path))

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from envedit.cli import map_command
+from envedit.cli import doctor, map_command
 from envedit.cli.streams import steady
 
 RESULTS = ("compare.json", "difference.png")
@@ -37,7 +37,7 @@ def _compare(arguments, console):
     from envedit.report import manifest, output_folder, preview
 
     # ---- The maps and what is measured of them
-    map_command.select_variant()
+    doctor.select()
     first = map_command.read(arguments.first, arguments, console)
     second = map_command.read(arguments.second, arguments, console)
     other = second.radiance

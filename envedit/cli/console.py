@@ -27,22 +27,6 @@ def make_parser(
     )
 
 
-def exit_code(name: str, action: Callable[[], int], interrupted: str = "interrupted") -> int:
-    """Return the exit code of an action, or of a user's error or of Ctrl-C, which are reported on stderr.
-
-    The lines there begin with ``name``; ``interrupted`` is said after Ctrl-C.
-    """
-    try:
-        with unwrapped():
-            return action()
-    except EnveditError as error:
-        print(f"{name}: {error}", file=sys.stderr)
-        return error.exit_code
-    except KeyboardInterrupt:
-        print(f"{name}: {interrupted}", file=sys.stderr)
-        return 130
-
-
 class Console:
     """What a run writes: lines to stdout, progress, warnings and errors to stderr, the object of ``--json``.
 
@@ -52,7 +36,10 @@ class Console:
         What the object of ``--json`` will have beside the exit code.
     """
 
-    def __init__(self, quiet: bool = False, one_object: bool = False, json_lines: bool = False):
+    def __init__(
+        self, quiet: bool = False, one_object: bool = False, json_lines: bool = False, name: str = "envedit"
+    ):
+        self._name = name  # what the lines on stderr begin with
         self._quiet = quiet
         self._one_object = one_object
         self._json_lines = json_lines
@@ -66,12 +53,12 @@ class Console:
     def warn(self, text: str) -> None:
         """Report a warning."""
         self.facts.setdefault("warnings", []).append(text)
-        self._report("warning", text, f"envedit: warning: {text}")
+        self._report("warning", text, f"{self._name}: warning: {text}")
 
     def error(self, text: str) -> None:
         """Report an error."""
         self.facts["error"] = text
-        self._report("error", text, f"envedit: {text}")
+        self._report("error", text, f"{self._name}: {text}")
 
     def _report(self, kind, text, line):
         if self._json_lines:
@@ -91,3 +78,18 @@ class Console:
         """Write the object, if one is asked for."""
         if self._one_object:
             print(json.dumps({"ok": code == 0, "exit_code": code, **self.facts}))
+
+
+def exit_code(console: Console, action: Callable[[], int], interrupted: str = "interrupted") -> int:
+    """Return the exit code of an action, or of a user's error or of Ctrl-C, which are reported."""
+    try:
+        with unwrapped():
+            code = action()
+    except EnveditError as error:
+        console.error(str(error))
+        code = error.exit_code
+    except KeyboardInterrupt:
+        console.error(interrupted)
+        code = 130
+    console.close(code)
+    return code

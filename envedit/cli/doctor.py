@@ -150,6 +150,15 @@ def ensure(variant: str = "llvm_ad_rgb") -> None:
             write_atomically(memory, json.dumps({"ok": True, "library": stamp or [None]}).encode())
 
 
+def select(variant: str = "llvm_ad_rgb") -> None:
+    """Select a variant of Mitsuba, as quiet as a command is, if :func:`ensure` finds that it works here."""
+    ensure(variant)
+    import mitsuba as mi
+
+    mi.set_variant(variant)
+    mi.set_log_level(mi.LogLevel.Error)
+
+
 def _explain(variant: str, code: int | None, error_output: str, versions: dict) -> tuple[str, str]:
     """Turn how the child ended and what it wrote to stderr into one line of cause and one of remedy."""
     backend = _backend(variant, versions)

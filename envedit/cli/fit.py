@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import mitsuba as mi
 
 from envedit import config, inputs
 from envedit.cli import doctor
-from envedit.cli.console import exit_code, make_parser
+from envedit.cli.console import Console, exit_code, make_parser
 from envedit.cli.progress import Progress
 from envedit.cli.streams import steady
 from envedit.config import presets
@@ -49,22 +48,25 @@ def main(argv: list[str] | None = None) -> int:
     arguments = parser.parse_args(argv)
     goes_on = "running it again goes on where the fit was last kept"
     interrupted = f"interrupted; no results were written ({goes_on})"
-    return exit_code("envedit", lambda: _run(arguments), interrupted)
+    console = Console()
+    return exit_code(console, lambda: _run(arguments, console), interrupted)
 
 
-def _run(arguments):
+def _run(arguments, console):
     overrides = [f"input.envmap={config.quote(arguments.map)}", *arguments.overrides]
     settings = config.loads("", Path.cwd(), "command line", arguments.preset, overrides)
-    doctor.ensure(settings.variant)
-    mi.set_variant(settings.variant)
+    doctor.select(settings.variant)
     original, warnings = inputs.load_map(settings.input)
     folder = Path(arguments.out or f"{Path(arguments.map).stem}_fit")
     with output_folder.alone(folder):
         output_folder.prepare_folder(folder, ("fit.json", "fitted.exr", "preview.png"), [arguments.map])
-        return _fit(arguments, settings, original, warnings, folder)
+        for line in warnings:
+            console.warn(line)
+        _fit(arguments, settings, original, folder, console)
+    return 0
 
 
-def _fit(arguments, settings, original, warnings, folder):
+def _fit(arguments, settings, original, folder, console):
     """Fit, and leave the results in a folder."""
     rows = inputs.active_rows(settings.input.rows, original.shape[0])
     active = original[rows.slice]
@@ -103,10 +105,7 @@ def _fit(arguments, settings, original, warnings, folder):
         "cached": fitted.cached,
     }
     manifest.write_json(folder / "fit.json", numbers)
-    for line in warnings:
-        print(f"envedit: warning: {line}", file=sys.stderr)
     log_psnr = "undefined" if fitted.log_psnr is None else f"{fitted.log_psnr:.1f}"
     peak_ratio = "undefined" if fitted.peak_ratio is None else f"{fitted.peak_ratio:.2f}"
     seconds = f"{fitted.seconds:.1f} s{' (kept from an earlier run)' if fitted.cached else ''}"
-    print(f"log-PSNR {log_psnr} dB, peak ratio {peak_ratio}, {seconds}; results in {folder}")
-    return 0
+    console.say(f"log-PSNR {log_psnr} dB, peak ratio {peak_ratio}, {seconds}; results in {folder}")

@@ -6,7 +6,7 @@ import difflib
 import os
 from pathlib import Path
 
-from envedit.cli.console import exit_code, make_parser
+from envedit.cli.console import Console, exit_code, make_parser
 from envedit.cli.streams import steady
 from envedit.core import shipped
 
@@ -71,7 +71,7 @@ def main(argv: list[str] | None = None) -> int:
         "--out", metavar="FILE", default="edit.toml", help="file to write (default: edit.toml)"
     )
     arguments = parser.parse_args(argv)
-    return exit_code("envedit", lambda: _write(arguments))
+    return exit_code(Console(), lambda: _write(arguments))
 
 
 def _write(arguments):

@@ -16,13 +16,16 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from envedit.cli import console
 from envedit.cli.console import Console
-from envedit.core.errors import EnveditError, unwrapped
+from envedit.core.errors import MachineError
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from envedit.inputs import InputMap
 
 MAP_HELP = "an OpenEXR or Radiance HDR file, lat-long, 2:1"
@@ -85,22 +88,16 @@ def run(
 ) -> int:
     """Carry out a command, report its errors, with ``--json`` in the object too, and return its exit code."""
     arguments = parser.parse_args(argv)
-    console = Console(one_object=arguments.json)
-    code = 0
-    try:
-        with unwrapped():
-            action(arguments, console)
-    except EnveditError as error:
-        console.error(str(error))
-        code = error.exit_code
-    except MemoryError:
-        console.error("not enough memory for this map; make it smaller")
-        code = 4
-    except KeyboardInterrupt:
-        console.error("interrupted; no file was left half written")
-        code = 130
-    console.close(code)
-    return code
+    terminal = Console(one_object=arguments.json)
+
+    def carry_out():
+        try:
+            action(arguments, terminal)
+        except MemoryError:
+            raise MachineError("not enough memory for this map; make it smaller") from None
+        return 0
+
+    return console.exit_code(terminal, carry_out, "interrupted; no file was left half written")
 
 
 def read(path: str, arguments: argparse.Namespace, console: Console) -> InputMap:
@@ -113,13 +110,9 @@ def read(path: str, arguments: argparse.Namespace, console: Console) -> InputMap
     return input_map
 
 
-def select_variant() -> None:
-    """Select the variant of Mitsuba for PNG files, the analytic sky and metrics; MachineError without one."""
-    import mitsuba as mi
+def write(file: Path, stored: np.ndarray, like: InputMap, console: Console) -> None:
+    """Write a map as of :func:`.map_file.write`, and report its warnings."""
+    from envedit.maps import map_file
 
-    from envedit import config
-    from envedit.cli import doctor
-
-    variant = config.Config().variant
-    doctor.ensure(variant)
-    mi.set_variant(variant)
+    for warning in map_file.write(file, stored, like):
+        console.warn(warning)

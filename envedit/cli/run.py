@@ -15,8 +15,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from envedit.cli import run_options
-from envedit.cli.console import Console
+from envedit.cli import doctor, run_options
+from envedit.cli.console import Console, exit_code
 from envedit.cli.streams import steady
 from envedit.core import shipped
 
@@ -28,29 +28,17 @@ if TYPE_CHECKING:
 def main(argv: list[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     begun = time.perf_counter()
-    from envedit.core.errors import EnveditError, unwrapped
-
     parser = run_options.make_parser()
     arguments = parser.parse_args(argv)
     if arguments.config is None:
         known = ", ".join(shipped.configurations())
         parser.error(f"got no CONFIG, expected a file, such as CONFIG.toml, or one of {known}")
     console = Console(arguments.quiet, arguments.json, arguments.progress == "json")
-    try:
-        with unwrapped():
-            code = _run(arguments, console, begun)
-    except EnveditError as error:
-        console.error(str(error))
-        code = error.exit_code
-    except KeyboardInterrupt:
-        if arguments.dry_run or arguments.export_initial is not None:
-            console.error("interrupted; run the same command again")
-        else:
-            fit = "an unfinished SIREN fit continues from its last saved state"
-            console.error(f"interrupted before the first checkpoint; --resume would start anew ({fit})")
-        code = 130
-    console.close(code)
-    return code
+    fit = "an unfinished SIREN fit continues from its last saved state"
+    interrupted = f"interrupted before the first checkpoint; --resume would start anew ({fit})"
+    if arguments.dry_run or arguments.export_initial is not None:
+        interrupted = "interrupted; run the same command again"
+    return exit_code(console, lambda: _run(arguments, console, begun), interrupted)
 
 
 def load(name: str, preset: str | None, overrides: Iterable[str]) -> tuple[config.Config, Path | None, Path]:
@@ -137,7 +125,7 @@ def _run(arguments, console, begun):
 
 def _edit(settings, base, budget, resume, console, begun):
     """Carry out an edit and leave its results in its folder, in which nobody else works."""
-    _select_variant(settings.variant)
+    doctor.select(settings.variant)
     from envedit import pipeline
 
     folder = Path(settings.output.dir)
@@ -193,17 +181,6 @@ def _write(result, folder, base, import_s, console, notes):
     _note_results(console, folder)
 
 
-def _select_variant(variant):
-    """Select a variant of Mitsuba that is known to work on this machine."""
-    from envedit.cli import doctor
-
-    doctor.ensure(variant)
-    import mitsuba as mi
-
-    mi.set_variant(variant)
-    mi.set_log_level(mi.LogLevel.Error)
-
-
 def _keep_map(folder, stop):
     """Write the map that an edit has come to which was cut short."""
     from envedit import config
@@ -214,7 +191,7 @@ def _keep_map(folder, stop):
 
 def _export_initial(settings, base, file, console):
     """Write the picture to paint on, and nothing else."""
-    _select_variant(settings.variant)
+    doctor.select(settings.variant)
     from envedit import inputs
     from envedit.report import output_folder
     from envedit.targets import initial_rendering
@@ -263,7 +240,7 @@ def _export_initial(settings, base, file, console):
 
 def _dry_run(settings, base, console):
     """Write what a run would edit towards, and nothing else: a picture to look at, and linear radiance."""
-    _select_variant(settings.variant)
+    doctor.select(settings.variant)
     from envedit import inputs
     from envedit.images import images
     from envedit.report import output_folder, preview

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from envedit.cli import map_command
+from envedit.cli import doctor, map_command
 from envedit.cli.map_command import number
 from envedit.cli.streams import steady
 from envedit.core.errors import ConfigError
@@ -51,7 +51,7 @@ def _sky(arguments, console):
 
     azimuth, elevation = _sun(arguments)
     path = map_file.output_path(arguments.out, "sky", [], arguments.overwrite)
-    map_command.select_variant()
+    doctor.select()
     sky = analytic_sky.sunsky(arguments.width, azimuth, elevation, arguments.turbidity)
     map_file.write(path, sky)
     console.facts |= {"files": {"map": str(path)}, "azimuth": azimuth, "elevation": elevation}

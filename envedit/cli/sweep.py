@@ -80,6 +80,6 @@ def exit_code(name: str, action: Callable[[], int]) -> int:
 
     previous = signal.signal(signal.SIGTERM, interrupt)
     try:
-        return console.exit_code(name, action, "interrupted; run again to continue")
+        return console.exit_code(console.Console(name=name), action, "interrupted; run again to continue")
     finally:
         signal.signal(signal.SIGTERM, previous)

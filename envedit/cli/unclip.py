@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from envedit.cli import map_command
+from envedit.cli import doctor, map_command
 from envedit.cli.streams import steady
 from envedit.core.errors import ConfigError
 
@@ -47,7 +47,7 @@ def _unclip(arguments, console):
 
     _check(arguments)
     path = map_file.output_path(arguments.out, "unclipped", [arguments.map], arguments.overwrite)
-    map_command.select_variant()
+    doctor.select()
     input_map = map_command.read(arguments.map, arguments, console)
     radiance = input_map.radiance
     light = clipped_light.find(radiance)
@@ -78,8 +78,7 @@ def _unclip(arguments, console):
 
     # ---- The map with it
     edited = unclip.restored(radiance, light, flux)
-    for warning in map_file.write(path, input_map.as_stored(edited), input_map):
-        console.warn(warning)
+    map_command.write(path, input_map.as_stored(edited), input_map, console)
     horizontal = float(unclip.luminance(flux)) * max(float(light.direction[1]), 0)
     sky = float(unclip.luminance(light.sky_irradiance))
     ratio = horizontal / max(sky, 1e-300)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from envedit.cli.console import exit_code, make_parser
+from envedit.cli.console import Console, exit_code, make_parser
 from envedit.cli.streams import steady
 
 
@@ -36,4 +36,6 @@ def main(argv: list[str] | None = None) -> int:
             print(folder / name)
         return 0
 
-    return exit_code("envedit weights", fetch, "interrupted; nothing was replaced by half a file")
+    return exit_code(
+        Console(name="envedit weights"), fetch, "interrupted; nothing was replaced by half a file"
+    )

@@ -15,6 +15,7 @@ import contextlib
 import difflib
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from numbers import Integral, Real
 from os import PathLike, fspath
@@ -261,7 +262,7 @@ class Numbers(Check):
     def __init__(self, *checks: Check) -> None:
         object.__setattr__(self, "checks", checks)
 
-    def _take(self, value: Any) -> list[float]:
+    def _take(self, value: Any) -> Sequence[float]:
         if not isinstance(value, list | tuple) or len(value) != len(self.checks):
             raise WantedError(str(self))
         return [check(v) for check, v in zip(self.checks, value, strict=True)]
@@ -286,7 +287,7 @@ class Pair(Numbers):
     def __init__(self, check: Check) -> None:
         super().__init__(check, check)
 
-    def _take(self, value: Any) -> tuple[Any, ...]:
+    def _take(self, value: Any) -> tuple[float, ...]:
         return tuple(super()._take(value))
 
 

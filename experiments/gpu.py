@@ -50,17 +50,8 @@ def commands(step: str, variant: str, small: bool, folder: str) -> list[list[str
         chosen = ["--only", "siren-standard", "transport-sphere", "--out", folder]
         return [[*python, "experiments", "engine", "run", *chosen, *variable, *["--quick"] * small]]
     if step == "solver":
-        edit = [
-            "sphere",
-            "--envmap",
-            "sunsky",
-            "--rotate",
-            "60",
-            "--set",
-            "representation.turn=false",
-            *sizes,
-        ]
-        return [[*run, *edit], [*run, *edit]]
+        edit = ["sphere", "--envmap", "sunsky", "--rotate", "60", "--set", "representation.turn=false"]
+        return 2 * [[*run, *edit, *sizes]]
     epochs = 6 if small else CPU_EPOCHS if variant == CPU else EPOCHS
     fit = [*python, "envedit", "fit", "sunsky", "--preset", "paper", "--out", folder, *variable, *sizes[:2]]
     fit += ["--set", "fit.cache=false"]

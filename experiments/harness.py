@@ -58,30 +58,14 @@ GAP = 3
 
 @dataclass(frozen=True)
 class Case:
-    """One run of an experiment.
+    """One run of an experiment."""
 
-    Attributes
-    ----------
-    name : str
-        Unique in the experiment; what ``--only`` looks at.
-    tables : dict
-        Configuration.
-    about : dict
-        What the columns and groups show of it.
-    command : sequence of str
-        What carries it out, as :data:`envedit.sweep.COMMAND`.
-    version : str
-        Whatever else decides what comes out, such as the code of another command.
-    result : str
-        The file with its numbers.
-    """
-
-    name: str
-    tables: dict
-    about: dict = field(default_factory=dict)
-    command: Sequence[str] = sweep.COMMAND
-    version: str = ""
-    result: str = "metrics.json"
+    name: str  # unique in the experiment; what ``--only`` looks at
+    tables: dict  # configuration
+    about: dict = field(default_factory=dict)  # what the columns and groups show of it
+    command: Sequence[str] = sweep.COMMAND  # what carries it out
+    version: str = ""  # whatever else decides what comes out, such as the code of another command
+    result: str = "metrics.json"  # the file with its numbers
 
     def job(self, overrides: Iterable[str] = ()) -> sweep.Job:
         """Return its job under overrides ``table.key=value``."""
@@ -92,16 +76,9 @@ class Case:
 def calling(name: str, function: str, tables: dict, about: dict | None = None, **arguments) -> Case:
     """Make a case that calls a function in place of ``envedit run``.
 
-    Parameters
-    ----------
-    name, tables, about
-        As of :class:`Case`.
-    function : str
-        ``package.module:name`` of a function (settings, folder, **arguments) -> dict; what it returns are the
-        metrics of the case. The code of its folder, and of the experiments that this imports from, is part
-        of the version.
-    **arguments
-        Of JSON.
+    ``function`` is ``package.module:name`` of a function (settings, folder, **arguments) -> dict: the metrics
+    of the case. Arguments are those of JSON. The code of its folder, and of the experiments that this imports
+    from, is part of the version.
     """
     folder = Path(importlib.util.find_spec(function.partition(":")[0]).origin).parent
     imported = re.findall(rb"^from experiments\.(\w+)", code_of(folder), re.M)
@@ -127,13 +104,7 @@ class Done:
 
     @cached_property
     def metrics(self) -> dict:
-        """Numbers of its result.
-
-        Raises
-        ------
-        InputError
-            The file cannot be read.
-        """
+        """Numbers of its result; InputError if the file cannot be read."""
         path = self.folder / self.case.result
         try:
             return json.loads(path.read_bytes())
@@ -185,59 +156,29 @@ def edit_panels(done: Done) -> list[np.ndarray]:
 
 @dataclass(frozen=True)
 class Experiment:
-    """What is run, measured and shown.
+    """What is run, measured and shown."""
 
-    Attributes
-    ----------
-    name, description : str
-        Of its command; a line.
-    cases : callable
-        Parsed command line -> list of Case.
-    measure : callable
-        Done -> dict, or a list of them where a case is several rows; with the case's ``about``, the columns
-        are made of them.
-    columns : dict
-        Heading -> format string, or callable of the row's dict that returns the text; or of each group
-        (a dict of dicts).
-    group : callable
-        Row -> heading of the part of the table that it belongs to; "" for one table.
-    failures : callable, optional
-        All rows -> a sentence for each thing that must hold and does not: exit code 1 if there are any.
-    summary : callable, optional
-        All rows -> Markdown that precedes the table.
-    combine : callable
-        All rows -> rows of the table, such as means over cases.
-    panels : callable
-        Done -> pictures of display values, of any size; a row of the sheet. None: no row.
-    sheet : callable
-        Case -> name of the sheet, a PNG; or with the ending .jpg.
-    options : callable
-        Adds the experiment's own options to the parser.
-    tabulate, draw : callable, optional
-        In place of columns and panels: (all cases with their jobs, folder of the runs, command line) ->
-        Markdown, or, with the folder of the sheets before the command line, -> files.
-    file : callable
-        Command line -> name of the table's file, without ending.
-    alone : bool
-        Times are measured: a case at a time, unless the command line says otherwise.
-    """
-
-    name: str
-    description: str
-    cases: Callable[[argparse.Namespace], list[Case]]
+    name: str  # of its command
+    description: str  # a line
+    cases: Callable[[argparse.Namespace], list[Case]]  # of the parsed command line
+    # A row of numbers, or several; with the case's ``about``, the columns are made of them
     measure: Callable[[Done], dict | list[dict]] = lambda done: done.metrics
+    # Heading -> format string, or callable of the row that returns the text; or this of each group
     columns: dict[str, Any] = field(default_factory=dict)
+    # Row -> heading of the part of the table that it belongs to; "" for one table
     group: Callable[[dict], str] = lambda row: ""
+    # All rows -> a sentence for each thing that must hold and does not: exit code 1 if there are any
     failures: Callable[[list[dict]], list[str]] | None = None
-    summary: Callable[[list[dict]], str] | None = None
-    combine: Callable[[list[dict]], list[dict]] = lambda rows: rows
+    summary: Callable[[list[dict]], str] | None = None  # all rows -> Markdown that precedes the table
+    combine: Callable[[list[dict]], list[dict]] = lambda rows: rows  # all rows -> rows of the table
+    # A row of the sheet: pictures of display values, of any size; no pictures: no row
     panels: Callable[[Done], list[np.ndarray]] = edit_panels
-    sheet: Callable[[Case], str] = lambda case: "sheet"
-    options: Callable[[argparse.ArgumentParser], None] = lambda parser: None
-    tabulate: Callable[[list, Path, argparse.Namespace], str] | None = None
+    sheet: Callable[[Case], str] = lambda case: "sheet"  # name of the sheet, a PNG; or with the ending .jpg
+    options: Callable[[argparse.ArgumentParser], None] = lambda parser: None  # adds the experiment's own
+    # In place of panels: all cases with their jobs, folders of runs and sheets, command line -> files
     draw: Callable[[list, Path, Path, argparse.Namespace], list[Path]] | None = None
-    file: Callable[[argparse.Namespace], str] = lambda given: "table"
-    alone: bool = False
+    file: Callable[[argparse.Namespace], str] = lambda given: "table"  # the table's file, without ending
+    alone: bool = False  # times are measured: a case at a time, unless the command line says otherwise
 
 
 def overridden(tables: dict, overrides: Iterable[str]) -> dict:
@@ -261,15 +202,7 @@ def done_of(cases: Iterable[tuple[Case, sweep.Job]], out: Path) -> list[Done]:
 
 
 def carry_out(cases, out: Path, given, stream=None) -> list[sweep.Outcome]:
-    """Run what is not done; with ``--dry-run`` only say what is.
-
-    Parameters
-    ----------
-    cases : list of (Case, Job)
-        In the order in which they are begun.
-    given : namespace
-        Options of :func:`parser`.
-    """
+    """Run what is not done of cases with their jobs, in this order; with ``--dry-run`` only say what is."""
     if given.dry_run:
         states = ["done" if (job.folder(out) / sweep.DONE).exists() else "missing" for _, job in cases]
         return [sweep.Outcome(job, state) for (_, job), state in zip(cases, states, strict=True)]
@@ -312,11 +245,9 @@ def table(experiment: Experiment, rows: list[dict]) -> str:
 
 
 def montage(rows: Sequence[Sequence[np.ndarray]]) -> np.ndarray:
-    """Put pictures of display values side by side in rows; smaller ones are enlarged by whole factors.
+    """Put pictures of display values side by side in rows, (H, W, 3) uint8.
 
-    Returns
-    -------
-    ndarray (H, W, 3) of uint8
+    Smaller ones are enlarged by whole factors.
     """
     height = max(len(picture) for row in rows for picture in row)
     strips = []
@@ -348,15 +279,7 @@ def sheets(experiment: Experiment, done: Sequence[Done], folder: Path) -> list[P
 def figure(file: Path, rows: int, columns: int, size: tuple[float, float], **subplots):
     """Give the panels of a figure to draw in, as ``matplotlib.pyplot.subplots``, and write it.
 
-    Parameters
-    ----------
-    size : (float, float)
-        Width and height, inches.
-
-    Raises
-    ------
-    ConfigError
-        matplotlib is missing.
+    ``size`` is width and height in inches. ConfigError if matplotlib is missing.
     """
     try:
         from matplotlib.figure import Figure
@@ -383,13 +306,7 @@ def add_options(parser: argparse.ArgumentParser, out: Path) -> None:
 
 
 def make(folder: Path) -> Path:
-    """Make a folder, and return it.
-
-    Raises
-    ------
-    InputError
-        It cannot be made.
-    """
+    """Make a folder, and return it; InputError if it cannot be made."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -398,12 +315,9 @@ def make(folder: Path) -> Path:
 
 
 def main(experiment: Experiment, argv: Sequence[str] | None = None) -> int:
-    """Run the command line of an experiment.
+    """Run an experiment's command line; returns the exit code.
 
-    Returns
-    -------
-    int
-        0; 1 if a case is not done; 2, 3 as ``envedit run``; 130 interrupted.
+    0; 1 if a case is not done; 2, 3 as ``envedit run``; 130 interrupted.
     """
     parser = argparse.ArgumentParser(
         prog=f"python -m experiments {experiment.name}", description=experiment.description
@@ -452,8 +366,8 @@ def _act(experiment, given):
             raise InputError(f"{out}: {NOTHING}")
         print("\n".join(map(str, draw(cases, out, to, given) if draw else sheets(experiment, done, to))))
         return 0
-    rows = [] if experiment.tabulate else rows_of(experiment, done)
-    text = experiment.tabulate(cases, out, given) if experiment.tabulate else table(experiment, rows)
+    rows = rows_of(experiment, done)
+    text = table(experiment, rows)
     write_atomically(to / f"{experiment.file(given)}.md", f"{text}\n".encode())
     print(text)
     wrong = experiment.failures(rows) if experiment.failures else []

@@ -63,8 +63,9 @@ class Counts:
 
 
 class Numbers:
-    """One measure over several rows: ``count``, ``mean``, ``median``, ``min`` and ``max``.
+    """One measure over several rows: ``count``, ``mean``, ``median``, ``min``, ``max``, ``sum``, ``rms``.
 
+    ``worst`` is the number with the largest magnitude.
     None and NaN are left out. ``above[0.05]`` and ``below[0]`` count the numbers on either side of a limit;
     ``[key]`` is a part of each, where they are dicts.
     """
@@ -74,10 +75,12 @@ class Numbers:
         measured = [value for value in measured if not isinstance(value, dict)]
         known = np.array([value for value in measured if value is not None and value == value], float)
         self.count = len(known)
-        statistics = [np.mean, np.median, np.min, np.max]
-        self.mean, self.median, self.min, self.max = (
-            Value(f(known) if self.count else "nan") for f in statistics
-        )
+        if not self.count:
+            known = np.array([np.nan])
+        self.mean, self.median = Value(known.mean()), Value(np.median(known))
+        self.min, self.max = Value(known.min()), Value(known.max())
+        self.sum, self.rms = Value(known.sum()), Value(np.sqrt(np.square(known).mean()))
+        self.worst = Value(known[np.abs(known).argmax()])
         self.above = Counts(lambda limit: (known > limit).sum())
         self.below = Counts(lambda limit: (known < limit).sum())
 

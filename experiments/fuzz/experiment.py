@@ -7,6 +7,7 @@ Linux only: memory is read from /proc.
 from experiments.fuzz.drive import FAULTS
 from experiments.fuzz.kinds import KINDS
 from experiments.harness import Experiment, calling
+from experiments.summary import Summary
 
 OUTCOMES = ("read", "refused", *FAULTS)
 PIECE = 2500
@@ -32,18 +33,8 @@ def measure(done) -> dict:
     """Return how many files of a piece had each outcome, and the most memory that one took, MiB."""
     found = done.metrics
     outcomes = {outcome: found["counts"].get(outcome, 0) for outcome in OUTCOMES}
+    outcomes["cases"] = sum(outcomes.values())
     return outcomes | {"mib": found["beyond"] / 2**20, "faults": found["faults"], "folder": done.folder}
-
-
-def combine(rows: list[dict]) -> list[dict]:
-    """Add up the pieces of each kind."""
-    found = []
-    for what in dict.fromkeys(row["what"] for row in rows):
-        some = [row for row in rows if row["what"] == what]
-        sums = {outcome: sum(row[outcome] for row in some) for outcome in OUTCOMES}
-        most = max(row["mib"] for row in some)
-        found.append({"what": what, "cases": sum(sums.values()), "mib": most} | sums)
-    return found
 
 
 def failures(rows: list[dict]) -> list[str]:
@@ -59,10 +50,13 @@ EXPERIMENT = Experiment(
     "Damage files of every kind that the package reads, and see that reading them ends well.",
     cases,
     measure,
-    {"what": "{what}", "cases": "{cases}", "read whole": "{read}", "refused": "{refused}"}
-    | {fault: f"{{{fault}}}" for fault in FAULTS}
-    | {"most memory beyond the declared image": "{mib:.1f} MiB"},
+    summary=Summary(
+        {"what": "{what}"},
+        {"cases": "{cases.sum:.0f}", "read whole": "{read.sum:.0f}", "refused": "{refused.sum:.0f}"}
+        | {fault: f"{{{fault}.sum:.0f}}" for fault in FAULTS}
+        | {"most memory beyond the declared image": "{mib.max:.1f} MiB"},
+    ),
     failures=failures,
-    combine=combine,
+    combine=lambda rows: [],  # the pieces of each kind are added up
     options=options,
 )

@@ -8,6 +8,7 @@ import json
 import tempfile
 import zlib
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -184,14 +185,8 @@ def read_checkpoint(path: Path, index: int) -> None:
 # ---- damage ------------------------------------------------------------------------------------------------
 
 
-def damaged_configuration(data: bytes, rng: np.random.Generator) -> bytes:
-    """Change the text of a configuration."""
-    return damage.of_text(data, rng, TOML)
-
-
-def damaged_scene(data: bytes, rng: np.random.Generator) -> bytes:
-    """Change the text of a scene."""
-    return damage.of_text(data, rng, XML)
+damaged_configuration = partial(damage.of_text, grammar=TOML)
+damaged_scene = partial(damage.of_text, grammar=XML)
 
 
 def damaged_entry(data: bytes, rng: np.random.Generator) -> bytes:

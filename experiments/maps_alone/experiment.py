@@ -1,9 +1,9 @@
 """Time the commands on a map alone, and their peak memory, on three public maps and on one of 8192 x 4096."""
 
+import json
 import os
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +12,9 @@ import envedit
 from envedit.core import latlong
 from envedit.images import images
 from experiments import puresky
-from experiments.harness import Experiment, calling
+from experiments.harness import Done, Experiment, calling
+from experiments.summary import Summary
+from experiments.tradeoff import cost
 
 LARGE = 8192
 """Columns of the large map, an enlarged small one."""
@@ -57,7 +59,7 @@ def case(name, line, first, second, width):
 
 
 def timed(settings, folder: Path, line: str, width: int | None) -> dict:
-    """Run a command in a process of its own; its seconds, those of all cores, and its peak memory in MB."""
+    """Run a command in a process of its own; returns exit code and cost, as :func:`.cost.main`."""
     files = [settings.input.envmap, settings.target.file]
     if width:
         files = [enlarged(file, folder.parent / f"{Path(file).stem}_{width}.exr", width) for file in files]
@@ -67,23 +69,12 @@ def timed(settings, folder: Path, line: str, width: int | None) -> dict:
         names["clipped"] = str(folder / "clipped.exr")
         images.write_exr(names["clipped"], np.minimum(envmap, CLIPPED_AT))
         del envmap
-    command = [part.format(**names) for part in line.split()]
+    command = [sys.executable, "-m", "envedit", *(part.format(**names) for part in line.split()), "--json"]
     environment = os.environ | {"PYTHONPATH": str(Path(envedit.__file__).parents[1])}
-    before = time.perf_counter()
-    process = subprocess.Popen(
-        [sys.executable, "-m", "envedit", *command, "--json"],
-        cwd=folder,
-        env=environment,
-        stdout=subprocess.DEVNULL,
-    )
-    _, status, usage = os.wait4(process.pid, 0)
-    process.returncode = os.waitstatus_to_exitcode(status)
-    return {
-        "exit_code": process.returncode,
-        "seconds": time.perf_counter() - before,
-        "cpu_seconds": usage.ru_utime + usage.ru_stime,
-        "megabytes": usage.ru_maxrss / 1024,
-    }
+    file = folder / "cost.json"
+    measuring = [sys.executable, "-S", cost.__file__, str(file), *command]
+    done = subprocess.run(measuring, cwd=folder, env=environment, stdout=subprocess.DEVNULL)
+    return {"exit_code": done.returncode, **json.loads(file.read_text())}
 
 
 def enlarged(file: str, to: Path, width: int) -> str:
@@ -94,15 +85,8 @@ def enlarged(file: str, to: Path, width: int) -> str:
     return str(to)
 
 
-def combine(rows: list[dict]) -> list[dict]:
-    """Return a row for each command and size: the largest of its maps."""
-    keys = "seconds", "cpu_seconds", "megabytes"
-    found = []
-    for command, size in dict.fromkeys((row["command"], row["size"]) for row in rows):
-        some = [row for row in rows if (row["command"], row["size"]) == (command, size)]
-        worst = {key: float(np.max([row[key] for row in some])) for key in keys}
-        found.append({"command": command, "size": size, "maps": len(some)} | worst)
-    return found
+def measure(done: Done) -> dict:
+    return done.metrics | {"megabytes": done.metrics["peak_bytes"] / 2**20}
 
 
 def failures(rows: list[dict]) -> list[str]:
@@ -118,15 +102,17 @@ EXPERIMENT = Experiment(
     "maps_alone",
     "Time the commands on a map alone, and measure their memory.",
     cases,
-    columns={
-        "command": "{command}",
-        "map": "{size}",
-        "maps": "{maps}",
-        "seconds": "{seconds:.1f}",
-        "seconds of all cores": "{cpu_seconds:.1f}",
-        "peak memory, MB": "{megabytes:.0f}",
-    },
-    combine=combine,
+    measure,
+    summary=Summary(
+        {"command": "{command}", "map": "{size}"},
+        {
+            "maps": "{runs}",
+            "seconds": "{wall_s.max:.1f}",
+            "seconds of all cores": "{cpu_s.max:.1f}",
+            "peak memory, MB": "{megabytes.max:.0f}",
+        },
+    ),
+    combine=lambda rows: [],  # the largest numbers of each command alone
     failures=failures,
     alone=True,
 )

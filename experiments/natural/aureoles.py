@@ -7,7 +7,7 @@ from envedit.images import images
 from envedit.representations.layers import aureoles
 from envedit.representations.layers.layers import Layers
 from experiments import puresky
-from experiments.harness import Experiment, calling, done_of, markdown
+from experiments.harness import Experiment, calling
 
 WIDTH = 512
 DEGREES = (2, 5, 10, 20, 40)
@@ -31,28 +31,27 @@ def measure_glow(settings, folder, file: str) -> dict:
 
 def cases(args):
     return [
-        calling(name, "experiments.natural.aureoles:measure_glow", {}, file=str(file))
+        calling(name, "experiments.natural.aureoles:measure_glow", {}, {"map": name}, file=str(file))
         for name, file in puresky.find().items()
     ]
 
 
-def tabulate(cases, out, args) -> str:
-    """Return glows by flux, and the power of the flux that the glow goes with."""
-    suns = {done.case.name: done.metrics for done in done_of(cases, out) if done.metrics}
-    if len(suns) < 3:
-        return f"{len(suns)} suns are measured"
-    suns = dict(sorted(suns.items(), key=lambda one: one[1]["flux"]))
-    head = ["map", "flux over sky", *(f"glow at {degrees}°" for degrees in DEGREES)]
-    rows = [[name, f"{sun['flux']:.2f}", *(f"{g:.1f}" for g in sun["glow"])] for name, sun in suns.items()]
-    glow = np.log([sun["glow"][DEGREES.index(POWER_DEGREES)] for sun in suns.values()])
-    flux = np.log([sun["flux"] for sun in suns.values()])
-    power = np.polyfit(flux, glow, 1)[0]
-    return f"{markdown(head, rows)}\n\nThe glow at {POWER_DEGREES} degrees goes with flux^{power:.2f}."
+def summary(rows) -> str:
+    """Return the power of the flux that the glow goes with."""
+    if len(rows) < 3:
+        return f"{len(rows)} suns are measured"
+    glow = np.log([row["glow"][DEGREES.index(POWER_DEGREES)] for row in rows])
+    power = np.polyfit(np.log([row["flux"] for row in rows]), glow, 1)[0]
+    return f"The glow at {POWER_DEGREES} degrees goes with flux^{power:.2f}."
 
 
 EXPERIMENT = Experiment(
     "natural.aureoles",
     "Measure how the glow of a sun goes with its flux.",
-    cases=cases,
-    tabulate=tabulate,
+    cases,
+    lambda done: [done.metrics] if done.metrics else [],
+    {"map": "{map}", "flux over sky": "{flux:.2f}"}
+    | {f"glow at {degrees}°": f"{{glow[{k}]:.1f}}" for k, degrees in enumerate(DEGREES)},
+    summary=summary,
+    combine=lambda rows: sorted(rows, key=lambda row: row["flux"]),
 )

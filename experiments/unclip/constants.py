@@ -11,7 +11,7 @@ from envedit.core.color import luminance
 from envedit.representations.layers import unclip
 from envedit.representations.layers.clipped_light import RING_DEGREES
 from experiments import puresky
-from experiments.harness import Experiment, calling, done_of, markdown
+from experiments.harness import Experiment, calling, markdown
 from experiments.unclip import clipping
 
 CLEAR = ("autumn_field", "kloofendal_48d_partly_cloudy", "sunflowers")
@@ -43,14 +43,14 @@ def measure_sun(settings, folder, file: str, map_name: str) -> dict:
 def cases(args):
     maps = {name: str(file) for name, file in puresky.find().items() if name in CLEAR + LOW}
     return [
-        calling(name, "experiments.unclip.constants:measure_sun", {}, file=file, map_name=name)
+        calling(name, "experiments.unclip.constants:measure_sun", {}, {"map": name}, file=file, map_name=name)
         for name, file in maps.items()
     ]
 
 
-def tabulate(cases, out, given) -> str:
+def summary(rows) -> str:
     """Return the constants, and the errors of each map by those without it, by first ring."""
-    suns = {done.case.name: done.metrics for done in done_of(cases, out)}
+    suns = {row["map"]: row for row in rows}
     if len(suns) < len(CLEAR + LOW):
         return f"{len(suns)} of {len(CLEAR + LOW)} suns are measured"
     aureole, haze, offsets = _constants(suns, "")
@@ -106,5 +106,6 @@ EXPERIMENT = Experiment(
     "unclip.constants",
     "Measure the constants by which the flux of a clipped sun is estimated, and their errors.",
     cases,
-    tabulate=tabulate,
+    summary=summary,
+    combine=lambda rows: [],  # what there is to show of each map is in the summary
 )

@@ -10,7 +10,7 @@ from envedit.images import images
 from envedit.representations.layers import clipped_light, unclip
 from experiments import puresky
 from experiments.harness import Experiment, calling, number
-from experiments.summary import Numbers
+from experiments.summary import Summary
 from experiments.unclip import clipping
 
 GROUPS = ("used for choices", "kept out of all choices", "rooms, low sun, night")
@@ -97,47 +97,32 @@ def cases(args):
 
 def summary(rows) -> str:
     """Return, for every set of maps and clipping, the errors over sunny maps and what was taken for what."""
-    lines = [
-        "| maps | clipped at | sunny: sun found | flux, stops: clipped | RMS with the sun back (worst) "
-        "| irradiance, stops: clipped | RMS with the sun back | shadow: truth | clipped | with the sun back "
-        "| not sunny: false suns |",
-        "|---" * 11 + "|",
+    ordered = sorted(rows, key=lambda row: (GROUPS.index(row["set"]), clipping.LEVELS.index(row["level"])))
+    parts = [
+        {
+            "sunny": row if row["sunny"] else None,
+            "back": row if row["sunny"] and row["added"] else None,
+            "other": None if row["sunny"] else row,
+        }
+        for row in ordered
     ]
-    for of in GROUPS:
-        for level in clipping.LEVELS:
-            some = [row for row in rows if row["set"] == of and row["level"] == level]
-            if not some:
-                continue
-            sunny = [row for row in some if row["sunny"]]
-            back = [row for row in sunny if row["added"]]
-            mean = {key: Numbers([row[key] for row in sunny]).mean for key in MEANS}
-            flux = np.array([row["flux"] for row in back])
-            irradiance = np.array([row["irradiance"] for row in back])
-            wrong = sum(row["false"] for row in some)
-            worst = float(flux[np.argmax(np.abs(flux))]) if len(flux) else float("nan")
-            cells = [
-                of,
-                level,
-                f"{len(back)} of {len(sunny)}",
-                number(mean["clipped_flux"], "+.1f"),
-                f"{number(rms(flux))} ({number(worst, '+.1f')})",
-                number(mean["clipped_irradiance"], "+.2f"),
-                number(rms(irradiance), ".2f"),
-                number(mean["true_contrast"], ".2f"),
-                number(mean["clipped_contrast"], ".2f"),
-                number(mean["contrast"], ".2f"),
-                f"{wrong} of {len(some) - len(sunny)}",
-            ]
-            lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
+    return STATISTICS([row | part for row, part in zip(ordered, parts, strict=True)])
 
 
-MEANS = ("clipped_flux", "clipped_irradiance", "true_contrast", "clipped_contrast", "contrast")
-
-
-def rms(values: np.ndarray) -> float:
-    """Return the root mean square; NaN of nothing."""
-    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else float("nan")
+STATISTICS = Summary(
+    {"maps": "{set}", "clipped at": "{level}"},
+    {
+        "sunny: sun found": "{back[true_contrast].count} of {sunny[true_contrast].count}",
+        "flux, stops: clipped": "{sunny[clipped_flux].mean:+.1f}",
+        "RMS with the sun back (worst)": "{back[flux].rms:.1f} ({back[flux].worst:+.1f})",
+        "irradiance, stops: clipped": "{sunny[clipped_irradiance].mean:+.2f}",
+        "RMS with the sun back": "{back[irradiance].rms:.2f}",
+        "shadow: truth": "{sunny[true_contrast].mean:.2f}",
+        "clipped": "{sunny[clipped_contrast].mean:.2f}",
+        "with the sun back": "{sunny[contrast].mean:.2f}",
+        "not sunny: false suns": "{other[false].above[0]} of {other[false].count}",
+    },
+)
 
 
 def panels(done):

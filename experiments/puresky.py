@@ -14,17 +14,9 @@ _HOW = "python -m experiments.download_puresky DIR fetches them"
 
 
 def data(holds: str = "puresky/NAME_puresky_1k.hdr", how: str = _HOW) -> Path:
-    """Return the folder that ENVEDIT_DATA names.
+    """Return the folder that ENVEDIT_DATA names; ConfigError if it is not set.
 
-    Parameters
-    ----------
-    holds, how : str
-        What is looked for in it and how it is had, for the error.
-
-    Raises
-    ------
-    ConfigError
-        ENVEDIT_DATA is not set.
+    The error says what is looked for in the folder, and how it is had.
     """
     if not (root := os.environ.get("ENVEDIT_DATA")):
         raise ConfigError(f"no maps: set ENVEDIT_DATA to a folder with {holds}; {how}")
@@ -32,20 +24,10 @@ def data(holds: str = "puresky/NAME_puresky_1k.hdr", how: str = _HOW) -> Path:
 
 
 def find(folder: str | Path | None = None) -> dict[str, Path]:
-    """List the maps of a folder by name.
+    """List the maps of a folder by name; without one, of the folder ``puresky`` of ENVEDIT_DATA.
 
-    Parameters
-    ----------
-    folder : path, optional
-        With files NAME_puresky_1k.hdr (or .exr, or of another resolution: of several the smallest is taken);
-        None: the folder ``puresky`` of ENVEDIT_DATA.
-
-    Raises
-    ------
-    ConfigError
-        No folder is given and ENVEDIT_DATA is not set.
-    InputError
-        It is no folder, or holds no map.
+    Files are NAME_puresky_1k.hdr, or .exr, or of another resolution: of several the smallest is taken.
+    InputError if it is no folder, or holds no map; ConfigError as :func:`data`.
     """
     folder = Path(folder or data() / "puresky").absolute()
     if not folder.is_dir():
@@ -61,13 +43,7 @@ def find(folder: str | Path | None = None) -> dict[str, Path]:
 
 
 def file(name: str) -> str:
-    """Return the file of a map of ENVEDIT_DATA.
-
-    Raises
-    ------
-    ConfigError, InputError
-        As :func:`find`; or there is no map of this name.
-    """
+    """Return the file of a map of ENVEDIT_DATA; ConfigError if there is none of this name."""
     found = find()
     if name not in found:
         close = difflib.get_close_matches(name, found, 1)

@@ -41,19 +41,10 @@ METHODS = {
 
 
 def estimate(settings, folder, spp, least=None) -> dict:
-    """Estimate the sky from its rendering.
+    """Estimate the sky from its rendering, by ``spp`` samples a pixel of a step; 0: stored transport.
 
-    Parameters
-    ----------
-    spp : int
-        Samples a pixel of a step's path tracing; 0: stored transport.
-    least : float, optional
-        Least radiance that a step may lead to.
-
-    Returns
-    -------
-    dict
-        ``losses`` of every step, ``judged``: rows of :func:`judge`, ``step_s``: median seconds of a step.
+    ``least`` is the least radiance that a step may lead to. Returns ``losses`` of every step, ``judged``:
+    rows of :func:`judge`, ``step_s``: median seconds of a step.
     """
     scene = inputs.load_scene(settings.scene)
     true = sky()
@@ -120,13 +111,10 @@ def squared_error(picture, target):
 def judge(scene, render, envmap, true, target, first=FRESH) -> dict:
     """Judge a map by Mitsuba, and the noise of what renders it, with the seeds of steps from ``first``.
 
-    Returns
-    -------
-    dict
-        ``loss``: mean product of the errors of two independent renderings, which their variance does not
-        bias. ``variance`` of the pictures of a step, mean over pixels. ``noise``: of the squared length of a
-        step's gradient, the share that two gradients of the same map do not have in common. ``psnr`` of the
-        upper half of the map, as the ground hides the other. ``least`` radiance of the map.
+    Returns ``loss``: mean product of the errors of two independent renderings, which their variance does not
+    bias; ``variance`` of the pictures of a step, mean over pixels; ``noise``: of the squared length of a
+    step's gradient, the share that two gradients of the same map do not have in common; ``psnr`` of the upper
+    half of the map, as the ground hides the other; ``least`` radiance of the map.
     """
     reference = path_tracing(scene, JUDGE_SPP)
     one, other = (reference(envmap, first + k).numpy() - target.numpy() for k in (1, 2))

@@ -13,12 +13,9 @@ NOISE, NOISE_SEEDS = 1e-3, 5
 def measure(settings, quick: bool = False) -> dict:
     """Fit the map of a configuration by its recipe.
 
-    Returns
-    -------
-    dict
-        ``fits``: a row with ``peak`` of the map's luminance, ``log_psnr`` (dB), ``peak_ratio``,
-        ``mean_ratio`` of luminance, ``seconds``; ``noisy_mean`` and ``noisy_worst``: log-PSNR with N(0, 1e-3)
-        added to all weights and biases, over five seeds.
+    Returns ``fits``: a row with ``peak`` of the map's luminance, ``log_psnr`` (dB), ``peak_ratio``,
+    ``mean_ratio`` of luminance, ``fitted_s``; ``noisy_mean`` and ``noisy_worst``: log-PSNR with N(0, 1e-3)
+    added to all weights and biases, over five seeds.
     """
     original, _ = load_map(settings.input)
     rows = active_rows(settings.input.rows, original.shape[0])

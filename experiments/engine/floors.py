@@ -38,12 +38,9 @@ def bandwidth(elements: int | None = None) -> dict:
     ``elements`` is the number of floats in an array; by default of twice the largest cache, 256 MiB or more,
     but at most a sixteenth of the memory.
 
-    Returns
-    -------
-    dict
-        ``array_bytes``, ``cache_bytes``; ``rates``: bytes a second by name; ``read``: the best of those that
-        only read, which is the floor that reading T is held against. A triad a = b + s c counts 12 bytes an
-        element: what the processor reads of ``a`` before it writes there is not counted (McCalpin's STREAM).
+    Returns ``array_bytes``, ``cache_bytes``; ``rates``: bytes a second by name; ``read``: the best of those
+    that only read, which is the floor that reading T is held against. A triad a = b + s c counts 12 bytes an
+    element: what the processor reads of ``a`` before it writes there is not counted (McCalpin's STREAM).
     """
     cache = largest_cache()
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
@@ -90,11 +87,8 @@ def largest_cache() -> int | None:
 def matmul(shapes=SHAPES) -> list[dict]:
     """Measure Dr.Jit's matrix products of a hidden layer: forward, and the two of the reverse pass.
 
-    Returns
-    -------
-    list of dict
-        A row for each shape and layout: ``width``, ``points``, ``layout`` ("rows": a point a row), and for
-        each product GFLOP/s, of the median.
+    Returns a row for each shape and layout: ``width``, ``points``, ``layout`` ("rows": a point a row), and
+    for each product GFLOP/s, of the median.
     """
     found, rng = [], np.random.default_rng(0)
     for width, points in shapes:
@@ -113,14 +107,7 @@ def matmul(shapes=SHAPES) -> list[dict]:
 
 
 def rays(count: int = 1 << 20) -> list[dict]:
-    """Measure rays a second in the scene ``sphere``.
-
-    Returns
-    -------
-    list of dict
-        ``rays``: coherent from the camera or from anywhere to anywhere, nearest hit or any; ``count``;
-        ``rate``: rays a second.
-    """
+    """Measure rays a second in the scene ``sphere``: coherent or not, nearest hit or any."""
     lit = scene.load("sphere", 256)
     rng = np.random.default_rng(0)
     across = dr.opaque(mi.Point2f(*(mi.Float(rng.random(count, np.float32)) for _ in range(2))))

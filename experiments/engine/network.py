@@ -28,17 +28,9 @@ LAYOUTS = ("columns", "rows")
 def measure(settings, torch: str | None = None, quick: bool = False) -> dict:
     """Measure ``siren.forward`` and ``siren.backward``, in turns with their products alone.
 
-    Parameters
-    ----------
-    torch : str, optional
-        An interpreter that has PyTorch, to compare with.
-
-    Returns
-    -------
-    dict
-        ``siren``: a row with the times of ``forward``, ``step`` and ``own``, the products alone; ``ratio``:
-        median of the step over that; ``kernels`` after warm-up; ``memory`` over 200 steps; ``torch``: the
-        peer, or None.
+    Returns ``siren``: a row with the times of ``forward``, ``step`` and ``own``, the products alone;
+    ``ratio``: median of the step over that; ``kernels`` after warm-up; ``memory`` over 200 steps; ``torch``:
+    times of that interpreter's PyTorch, or None.
     """
     hidden, depth, omega = (getattr(settings.representation, key) for key in ("hidden", "depth", "omega"))
     shape = (8, 32) if quick else MAP

@@ -33,10 +33,7 @@ def once(function: Callable) -> float:
 def side_by_side(functions: dict[str, Callable], repeats: int = REPEATS) -> dict:
     """Time functions in turns, so that whatever else the machine does meets all of them alike.
 
-    Returns
-    -------
-    dict
-        For each name ``median_s`` and ``min_s``.
+    Returns ``median_s`` and ``min_s`` for each name.
     """
     for function in functions.values():
         for _ in range(WARM_UP):
@@ -91,18 +88,10 @@ def machine() -> dict:
 
 
 def measured(settings, folder, measuring: str, **arguments) -> dict:
-    """Describe the machine, and then measure.
+    """Describe the machine, and then measure by ``module:name`` of this package.
 
-    Parameters
-    ----------
-    measuring : str
-        ``module:name`` of this package: (settings, **arguments) -> the rows of each table.
-
-    Returns
-    -------
-    dict
-        ``machine``, as it was before; ``seconds``; ``tables``: rows by table; ``not_finite``: where numbers
-        of them are NaN or infinite.
+    That is a function (settings, **arguments) -> the rows of each table. Returns ``machine``, as it was
+    before; ``seconds``; ``tables``: rows by table; ``not_finite``: where numbers of them are NaN or infinite.
     """
     module, _, name = measuring.partition(":")
     called = getattr(importlib.import_module(f"experiments.engine.{module}"), name)

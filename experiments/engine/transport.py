@@ -33,18 +33,8 @@ def measure(
 ) -> dict:
     """Measure T in a scene under a map, and steps of prb beside it.
 
-    Parameters
-    ----------
-    settings : Config
-        Scene, widths, samples of T and map.
-    sun : [float, float], optional
-        In place of the map, and compared with a reference: as of :func:`one_texel_sun`.
-    reference_spp : int
-        Samples a pixel of the reference.
-    prb_spp : int
-        Samples a pixel of prb.
-    disk : bool
-        Measure loading from disk as well, and the bandwidth.
+    A ``sun``, [elevation, across] of :func:`one_texel_sun`, takes the place of the map, and is compared with
+    a reference. With ``disk`` loading from there is measured as well, and the bandwidth.
 
     Returns
     -------
@@ -205,15 +195,8 @@ def adjointness(transport: LightTransport) -> float:
 def one_texel_sun(width: int, elevation: float, across: float) -> np.ndarray:
     """Return a grey sky (width / 2, width, 3) of 0.1 with a sun of 1e5 in one texel.
 
-    Parameters
-    ----------
-    width : int
-        Texels across.
-    elevation : float
-        Degrees above the horizon, to the nearest row.
-    across : float
-        Place in the map from its left edge, 0 to 1: at 0 behind the object, at 1/2 behind the camera of the
-        shipped scenes.
+    It is ``elevation`` degrees above the horizon, and ``across`` from the left edge, 0 to 1: at 0 behind the
+    object, at 1/2 behind the camera of the shipped scenes.
     """
     height = width // 2
     picture = np.full((height, width, 3), 0.1, np.float32)
@@ -231,12 +214,9 @@ def reference(lit, sky: np.ndarray, spp: int, depth: int = -1) -> list[np.ndarra
 def errors(got: np.ndarray, halves: list[np.ndarray], pixels=...) -> dict[str, float]:
     """Compare some pixels of a picture with a reference.
 
-    Returns
-    -------
-    dict
-        Root mean squares relative to the mean of the whole reference: ``rmse``; ``noise`` of the reference,
-        half of the difference of its halves, which differ by sqrt(2) times the noise of one where their mean
-        has 1/sqrt(2) of it; ``corrected``: sqrt(rmse^2 - noise^2), as the two are independent.
+    Returns root mean squares relative to the mean of the whole reference: ``rmse``; ``noise`` of the
+    reference, half of the difference of its halves, which differ by sqrt(2) times the noise of one where
+    their mean has 1/sqrt(2) of it; ``corrected``: sqrt(rmse^2 - noise^2), as the two are independent.
     """
     wanted = (halves[0] + halves[1]) / 2
     differences = got[pixels] - wanted[pixels], (halves[0] - halves[1])[pixels] / 2
@@ -247,12 +227,9 @@ def errors(got: np.ndarray, halves: list[np.ndarray], pixels=...) -> dict[str, f
 def compared(picture: np.ndarray, prb: list[np.ndarray], halves: list[np.ndarray]) -> dict[str, float]:
     """Compare T's picture, and several of prb, with a reference.
 
-    Returns
-    -------
-    dict
-        :func:`errors` of T; ``prb_rmse``, corrected; ``prb_times``: how many times as many samples prb would
-        need for T's error, as its squared error falls with their number. T's error is not corrected there,
-        which counts against T.
+    Returns :func:`errors` of T; ``prb_rmse``, corrected; ``prb_times``: how many times as many samples prb
+    would need for T's error, as its squared error falls with their number. T's error is not corrected there,
+    which counts against T.
     """
     found = errors(picture, halves)
     square = np.mean([errors(one, halves)["rmse"] for one in prb]) ** 2

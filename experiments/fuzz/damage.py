@@ -113,20 +113,11 @@ def _change_bytes(raw, rng):
 
 
 class Grammar(NamedTuple):
-    """How a text is damaged.
+    """How a text is damaged."""
 
-    Attributes
-    ----------
-    token : str
-        Regular expression of what is replaced, removed, doubled and exchanged.
-    words : sequence of str
-        What a token becomes.
-    nests : sequence of (str, str, str)
-        What opens, is within, and closes: repeated up to 32,768 times.
-    """
-
-    token: str
-    words: tuple[str, ...]
+    token: str  # regular expression of what is replaced, removed, doubled and exchanged
+    words: tuple[str, ...]  # what a token becomes
+    # What opens, is within, and closes: repeated up to 32,768 times
     nests: tuple[tuple[str, str, str], ...]
 
 

@@ -25,14 +25,8 @@ WHOLE = -2
 class Worker:
     """A worker process, started anew when it has ended.
 
-    Parameters
-    ----------
-    reader : str
-        As for :mod:`.worker`.
-    seconds : float
-        Processor time that a small file may take.
-    patience : float
-        Seconds of wall time, for each second of processor time that a case has, after which it is stuck.
+    ``reader`` is as for :mod:`.worker`, ``seconds`` the processor time that a small file may take,
+    ``patience`` the wall time, for each second of processor time that a case has, after which it is stuck.
     """
 
     def __init__(self, reader: str, seconds: float = 5.0, patience: float = 20.0):
@@ -99,20 +93,10 @@ class Worker:
 
 
 def piece(settings, folder, what: str, first: int, count: int, reader: str = "") -> dict:
-    """Read damaged files of one kind; those that go wrong, and why, are kept in ``folder``.
+    """Read damaged files of one of ``kinds.KINDS``; those that go wrong, and why, are kept in ``folder``.
 
-    Every worker reads all whole files first; one that is not read is a fault as well.
-
-    Parameters
-    ----------
-    settings : Config
-        Its seed is that of the damage.
-    what : str
-        One of ``kinds.KINDS``.
-    first, count : int
-        Which files; file i of a seed is the same whichever others are made.
-    reader : str
-        As for :class:`Worker`, in place of that of ``what``.
+    File i of the configuration's seed is the same whichever others are made. Every worker reads all whole
+    files first; one that is not read is a fault as well. ``reader`` takes the place of that of ``what``.
 
     Returns
     -------

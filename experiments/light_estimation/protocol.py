@@ -73,12 +73,8 @@ def render(sphere: Sphere, tonemapped_map: np.ndarray) -> np.ndarray:
     """Render a sphere under a tonemapped map (H, W, 3).
 
     Directions are sampled by the BSDF alone, with the same seed: they are the same under every map, and so is
-    most of the noise of two pictures.
-
-    Returns
-    -------
-    ndarray (540 / reduction, 960 / reduction, 4) float32
-        RGBA, black where there is no sphere.
+    most of the noise of two pictures. Returns RGBA (540 / reduction, 960 / reduction, 4) float32, black where
+    there is no sphere.
     """
     (width, height), crop = (size // sphere.reduction for size in FILM), CROP // sphere.reduction
     left, top = (width - crop) // 2, (height - crop) // 2
@@ -114,14 +110,11 @@ def display(picture: np.ndarray) -> np.ndarray:
 def compared(estimate: np.ndarray, true: np.ndarray) -> dict[str, float]:
     """Compare two pictures of a sphere, RGBA (H, W, 4), over the pixels where the first has an alpha.
 
-    Returns
-    -------
-    dict
-        ``rmse``: squared errors summed over channels, mean over pixels, square root; ``si_rmse``: the same
-        with the factor of the first picture at which it is least; ``angle``: between colours, degrees, mean
-        over the pixels that are black in neither, NaN without any; ``normalised``: ``rmse`` of pictures of
-        which each is scaled so that the 0.01th and 99.9th percentile of its values, those around the sphere
-        included, are 0 and 1.
+    Returns ``rmse``: squared errors summed over channels, mean over pixels, square root; ``si_rmse``: the
+    same with the factor of the first picture at which it is least; ``angle``: between colours, degrees, mean
+    over the pixels that are black in neither, NaN without any; ``normalised``: ``rmse`` of pictures of which
+    each is scaled so that the 0.01th and 99.9th percentile of its values, those around the sphere included,
+    are 0 and 1.
     """
     mask = estimate[..., 3] > 0
     scaled = [_scaled(np.float64(picture[..., :3]))[mask] for picture in (estimate, true)]
@@ -167,18 +160,9 @@ def peak_error(estimate: np.ndarray, true: np.ndarray) -> float:
 def lights_error(estimate: list[dict], true: list[dict], count: int = 5) -> float:
     """Return how far the lights of two maps are from each other, degrees (EnvMapNet, Somanath and Kurz 2021).
 
-    Parameters
-    ----------
-    estimate, true : list of dict
-        Lights of ``lights.json``, the strongest first.
-    count : int
-        So many of either count, and not more than the shorter list has, or two.
-
-    Returns
-    -------
-    float
-        Angle to the nearest light of the other list: mean over the lights of a list, mean of both lists. NaN
-        if there is no light in one of them.
+    Lights are those of ``lights.json``, the strongest first; ``count`` of either list count, and not more
+    than the shorter one has, or two. The angle to the nearest light of the other list: mean over the lights
+    of a list, mean of both lists; NaN if there is no light in one of them.
     """
     if not estimate or not true:
         return float("nan")

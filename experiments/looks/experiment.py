@@ -61,19 +61,10 @@ def in_its_light(settings, folder: Path, file: str, look: str) -> dict:
 
 
 def photometry(envmap: np.ndarray, toward: np.ndarray) -> tuple[float, float]:
-    """Measure a key light: flux over the irradiance of the horizontal plane by the rest, and its place.
+    """Measure the key light of a map (H, W, 3) that should be at the direction ``toward`` (3,).
 
-    Parameters
-    ----------
-    envmap : ndarray (H, W, 3)
-        Linear radiance.
-    toward : ndarray (3,)
-        Where it should be.
-
-    Returns
-    -------
-    stops, degrees : float
-        Its flux, and the angle of its centroid from there.
+    Returns its flux over the horizontal irradiance of the rest, stops, and how far its centroid is from
+    there, degrees.
     """
     height, width, _ = envmap.shape
     d = latlong.directions(height, width)

@@ -32,37 +32,20 @@ LEAST_ELEVATION, MOST_ELEVATION = 0.1, 1.5
 
 @dataclass(frozen=True)
 class Paint:
-    """A painted picture.
+    """A painted picture."""
 
-    Attributes
-    ----------
-    picture : ndarray (h, w, 3)
-        Linear radiance.
-    coverage : ndarray (h, w)
-        How much each pixel was painted, in [0, 1].
-    sun : ndarray (3,) or None
-        Where a sun makes what was painted, a unit vector in the map's frame.
-    """
-
-    picture: np.ndarray
-    coverage: np.ndarray
+    picture: np.ndarray  # (h, w, 3), linear radiance
+    coverage: np.ndarray  # (h, w), how much each pixel was painted, in [0, 1]
+    # (3,), where a sun makes what was painted, a unit vector in the map's frame
     sun: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
 class View:
-    """What the camera of a scene with one view sees, by a ray through the middle of each pixel.
-
-    Attributes
-    ----------
-    scene : Scene
-        The scene.
-    envmap : ndarray (H, W, 3)
-        The map that lights it.
-    """
+    """What the camera of a scene with one view sees, by a ray through the middle of each pixel."""
 
     scene: Scene
-    envmap: np.ndarray
+    envmap: np.ndarray  # (H, W, 3), the map that lights it
 
     @property
     def shape(self) -> tuple[int, int]:

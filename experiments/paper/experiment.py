@@ -34,24 +34,12 @@ OTHER = "autumn_field"
 
 @dataclass(frozen=True)
 class Kind:
-    """One table or figure.
+    """One table or figure."""
 
-    Attributes
-    ----------
-    rows : tuple of str
-        Of :data:`METHODS` or :data:`PAINTED`, in the order in which they are shown.
-    scene : str
-        Shipped scene; "" for a painted edit, which has its own.
-    roughness : tuple
-        Values of the scene's parameter, (None,): as the scene has it.
-    several : bool
-        Averaged over all maps; else of one, unless ``--all-maps`` is given.
-    """
-
-    rows: tuple[str, ...]
-    scene: str
-    roughness: tuple[float | None, ...] = (None,)
-    several: bool = False
+    rows: tuple[str, ...]  # of METHODS or PAINTED, in the order in which they are shown
+    scene: str  # shipped scene; "" for a painted edit, which has its own
+    roughness: tuple[float | None, ...] = (None,)  # values of its parameter; None: as the scene has it
+    several: bool = False  # averaged over all maps; else of one, unless --all-maps is given
 
 
 KINDS = {

@@ -44,16 +44,8 @@ def composed(
 class Plate:
     """A photograph without noise, and the scene with and without the ball.
 
-    Parameters
-    ----------
-    chosen : config.Scene
-        A shipped scene.
-    true : ndarray (H, W, 3)
-        The photograph's map.
-    camera : Camera
-        The photograph's camera.
-    folder : Path
-        For the scenes with the ball.
+    It is taken of a shipped scene under the ``true`` map (H, W, 3); the scenes with the ball go to
+    ``folder``.
     """
 
     def __init__(self, chosen: config.Scene, true: np.ndarray, camera: Camera, folder: Path):

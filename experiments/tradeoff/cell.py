@@ -29,10 +29,7 @@ def kernels() -> int:
 def carry_out(folder: Path) -> dict:
     """Carry out the run of a folder's ``job.toml`` there; returns what it cost, as :func:`.cost.main`.
 
-    Raises
-    ------
-    EnveditError
-        It failed.
+    EnveditError if it failed.
     """
     filled = {"python": sys.executable, "folder": folder, "threads": dr.thread_count()}
     run = [part.format(**filled) for part in sweep.COMMAND if part != "--resume"]
@@ -52,20 +49,9 @@ def carry_out(folder: Path) -> dict:
 def cell(settings: config.Config, folder: Path, scene: str, sets: list[str]) -> dict:
     """Carry out all runs of a cell, one after another, and judge what they left.
 
-    Parameters
-    ----------
-    settings : Config
-        Of the standard preset: the map, the scene and the turn that all runs have.
-    scene : str
-        One of :data:`.plan.SCENES`.
-    sets : list of str
-        Overrides of every run, ``table.key=value``.
-
-    Returns
-    -------
-    dict
-        ``runs``: ``setting``, ``cost`` and ``judged`` of each, as :class:`.Judge`; ``bounds`` as
-        :meth:`.Judge.bounds`.
+    ``settings`` have the map, the scene, one of :data:`.plan.SCENES`, and the turn of all runs, ``sets``
+    their overrides. Returns ``runs``: ``setting``, ``cost`` and ``judged`` of each, as :class:`.Judge`;
+    ``bounds`` as :meth:`.Judge.bounds`.
     """
     runs, standard = [], plan.base(settings.input.envmap, scene)
     for name, tables in plan.settings().items():

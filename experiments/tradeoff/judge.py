@@ -31,21 +31,8 @@ SUNNY = 1000.0
 class Judge:
     """Judge maps that were to be turned as ``settings`` say, in their scene.
 
-    Parameters
-    ----------
-    settings : Config
-        Map, scene and turn.
-    spp, true_spp : int
-        Samples a pixel of renderings that are judged, and of the reference.
-    width, film : int
-        Texels and pixels across.
-
-    Attributes
-    ----------
-    original, true : ndarray (H, W, 3)
-        The map before the edit, and the true one.
-    target : ndarray (2, h, w, 3)
-        Two independent renderings under the true map.
+    Renderings that are judged have ``spp`` samples a pixel, the reference ``true_spp``; maps are ``width``
+    texels across, pictures ``film`` pixels.
     """
 
     def __init__(self, settings: config.Config, spp=SPP, true_spp=TRUE_SPP, width=WIDTH, film=FILM):
@@ -53,17 +40,14 @@ class Judge:
         self._scene = scene.load(settings.scene.file, film, film, settings.scene.parameters)
         self._rows = inputs.active_rows("upper", width // 2).slice
         source = images.load_envmap(settings.input.envmap)[0]
-        self.original = self._sized(source)
+        self.original = self._sized(source)  # (H, W, 3), before the edit
         self.true = self._sized(latlong.rotate(source, settings.target.degrees))
-        self.target = self._halves(self.true, true_spp, TRUE_SEED)
+        self.target = self._halves(self.true, true_spp, TRUE_SEED)  # (2, h, w, 3)
 
     def __call__(self, folder: Path) -> dict:
         """Judge what a run left, at the resolution of its file where it has that.
 
-        Returns
-        -------
-        dict
-            As :meth:`compare`, with ``timing``: seconds of the run by part.
+        Returns the numbers of :meth:`compare`, and ``timing``: seconds of the run by part.
         """
         full = folder / "edited_full.exr"
         edited = images.read(str(full if full.exists() else folder / "edited.exr"))[0]

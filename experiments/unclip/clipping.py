@@ -31,22 +31,12 @@ SAMPLES = 256
 
 @dataclass(frozen=True)
 class Truth:
-    """The brightest light of a map.
+    """The brightest light of a map."""
 
-    Attributes
-    ----------
-    direction : ndarray (3,)
-        Unit vector to it.
-    flux, sky : float
-        Its irradiance on a surface that faces it, and the sky's horizontal irradiance; luminance.
-    sunny : bool
-        Whether it is a sun that casts shadows.
-    """
-
-    direction: np.ndarray
-    flux: float
-    sky: float
-    sunny: bool
+    direction: np.ndarray  # (3,), unit vector to it
+    flux: float  # irradiance on a surface that faces it, luminance
+    sky: float  # horizontal irradiance of the sky, luminance
+    sunny: bool  # whether it is a sun that casts shadows
 
 
 def load(file: str | Path) -> np.ndarray:

@@ -31,22 +31,7 @@ _PUBLIC = {
     "load_scene": "envedit.api",
     "sunsky": "envedit.api",
 }
-__all__ = [
-    "Config",
-    "ConfigError",
-    "EnveditError",
-    "InputError",
-    "LightTransport",
-    "MachineError",
-    "NumericalError",
-    "Result",
-    "Scene",
-    "edit",
-    "fit",
-    "load_map",
-    "load_scene",
-    "sunsky",
-]
+__all__ = sorted(_PUBLIC)
 
 
 def __getattr__(name: str) -> object:

@@ -173,8 +173,7 @@ def fit(
         network = config.Representation(**{"kind": "siren", **network})
     if isinstance(settings, Mapping):
         settings = config.Fit(**settings)
-    if mi.variant() is None:
-        mi.set_variant(config.Config().variant)
+    _select_variant()
     return siren.fit(pixels, network, settings, seed, rows, folder=folder, progress=progress)
 
 
@@ -215,8 +214,7 @@ def load_scene(
     InputError
         A file is missing or damaged, or the scene has something that is not supported.
     """
-    if mi.variant() is None:
-        mi.set_variant(config.Config().variant)
+    _select_variant()
     settings = config.Scene(
         width=width,
         height=height,
@@ -276,9 +274,14 @@ def sunsky(
         A value is out of its range.
     """
     checked = config.Input(width=width, azimuth=azimuth, elevation=elevation, turbidity=turbidity)
+    _select_variant()
+    return analytic_sky.sunsky(checked.width, checked.azimuth, checked.elevation, checked.turbidity)
+
+
+def _select_variant() -> None:
+    """Select the default variant of Mitsuba where none is selected."""
     if mi.variant() is None:
         mi.set_variant(config.Config().variant)
-    return analytic_sky.sunsky(checked.width, checked.azimuth, checked.elevation, checked.turbidity)
 
 
 def _loaded(scene: Any, settings: config.Scene, base: Path | None) -> Scene:

@@ -6,7 +6,6 @@ import os
 
 from envedit.cli import doctor, map_command
 from envedit.cli.map_command import number
-from envedit.cli.streams import steady
 from envedit.core.errors import ConfigError
 from envedit.maps.conventions import QUARTERS, turned_for
 
@@ -24,7 +23,6 @@ OPTIONS = {
 """Type, unit and help of each adjustment, in the order in which they are made; colours before lights."""
 
 
-@steady
 def main(argv: list[str] | None = None) -> int:
     """Adjust a map; returns the exit code."""
     parser = map_command.make_parser(

@@ -6,13 +6,11 @@ import os
 from pathlib import Path
 
 from envedit.cli import doctor, map_command
-from envedit.cli.streams import steady
 from envedit.core.errors import ConfigError
 
 LOOK = ".toml"
 
 
-@steady
 def main(argv: list[str] | None = None) -> int:
     """Apply looks to maps; returns the exit code."""
     parser = map_command.make_parser(

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from envedit.cli import doctor, map_command
-from envedit.cli.streams import steady
 
 
-@steady
 def main(argv: list[str] | None = None) -> int:
     """Blend two maps; returns the exit code."""
     parser = map_command.make_parser(

@@ -6,7 +6,6 @@ import shutil
 import sys
 
 from envedit.cli import console
-from envedit.cli.streams import steady
 
 KINDS = {
     "transport": "light transports of scenes",
@@ -16,7 +15,6 @@ KINDS = {
 }
 
 
-@steady
 def main(argv: list[str] | None = None) -> int:
     """Say what the cache holds, or empty it; returns the exit code."""
     parser = console.make_parser(

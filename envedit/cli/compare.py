@@ -7,13 +7,11 @@ from pathlib import Path
 import numpy as np
 
 from envedit.cli import doctor, map_command
-from envedit.cli.streams import steady
 
 RESULTS = ("compare.json", "difference.png")
 """What the command leaves in its folder."""
 
 
-@steady
 def main(argv: list[str] | None = None) -> int:
     """Compare two maps; returns the exit code."""
     parser = map_command.make_parser(

@@ -5,10 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from envedit.cli import console, map_command
-from envedit.cli.streams import steady
 
 
-@steady
 def main(argv: list[str] | None = None) -> int:
     """Convert a file; returns the exit code."""
     parser = console.make_parser(

@@ -7,7 +7,6 @@ import os
 from pathlib import Path
 
 from envedit.cli.console import Console, exit_code, make_parser
-from envedit.cli.streams import steady
 from envedit.core import shipped
 
 # Lines of "setting  # comment"; the comments are aligned when the settings are known.
@@ -43,7 +42,6 @@ WIDEST = 48
 """A setting that is wider than this, as with a long path, is not counted when comments are aligned."""
 
 
-@steady
 def main(argv: list[str] | None = None) -> int:
     """Write a configuration; returns the exit code."""
     scenes = ", ".join(shipped.scenes())

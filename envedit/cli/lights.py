@@ -8,13 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from envedit.cli import map_command
-from envedit.cli.streams import steady
 
 RESULTS = ("lights.json", "sky.exr", "lights.exr")
 """What the command leaves in its folder."""
 
 
-@steady
 def main(argv: list[str] | None = None) -> int:
     """Write the lights of a map; returns the exit code."""
     parser = map_command.make_parser(

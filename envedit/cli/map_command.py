@@ -2,7 +2,6 @@
 
 .. code-block:: python
 
-   @steady
    def main(argv: list[str] | None = None) -> int:
        parser = map_command.make_parser("adjust", "Adjust a map.", ["envedit adjust sky.hdr --exposure 1"])
        parser.add_argument("map", ...)
@@ -39,18 +38,10 @@ def make_parser(
     default: str | None = None,
     repair: bool = True,
 ) -> argparse.ArgumentParser:
-    """Make a parser with the options that all commands on a map have.
+    """Make a parser, as :func:`.console.make_parser`, with the options that all commands on a map have.
 
-    Parameters
-    ----------
-    command, description, examples
-        As of :func:`.console.make_parser`.
-    out : str
-        "FILE" or "DIR": what ``--out`` names.
-    default : str, optional
-        What it names without the option, for the help.
-    repair : bool
-        Whether there is the option of :func:`.map_file.read`.
+    ``out`` is what ``--out`` names, "FILE" or "DIR", ``default`` what it names without the option, for the
+    help; ``repair``: whether there is the option of :func:`.map_file.read`.
     """
     parser = console.make_parser(command, description, examples)
     where = f" (default: {default}, in the working folder)" if default else ""

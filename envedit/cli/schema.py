@@ -5,10 +5,8 @@ from __future__ import annotations
 import json
 
 from envedit.cli.console import make_parser
-from envedit.cli.streams import steady
 
 
-@steady
 def main(argv: list[str] | None = None) -> int:
     """Print the schema; returns the exit code."""
     parser = make_parser(

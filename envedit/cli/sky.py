@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from envedit.cli import doctor, map_command
 from envedit.cli.map_command import number
-from envedit.cli.streams import steady
 from envedit.core.errors import ConfigError
 
 MIDDLE = 180.0
 """Azimuth of the middle of a map."""
 
 
-@steady
 def main(argv: list[str] | None = None) -> int:
     """Write an analytic sky; returns the exit code."""
     parser = map_command.make_parser(

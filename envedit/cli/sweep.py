@@ -9,10 +9,8 @@ from collections.abc import Callable, Sequence
 
 from envedit import sweep as sweeps
 from envedit.cli import console
-from envedit.cli.streams import steady
 
 
-@steady
 def main(argv: list[str] | None = None, command: Sequence[str] = ()) -> int:
     """Carry out jobs; returns the exit code: 0, 1 if a job is not done, 2, 3 as ``envedit run``, 130."""
     parser = console.make_parser(

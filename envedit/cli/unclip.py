@@ -7,11 +7,9 @@ import math
 import numpy as np
 
 from envedit.cli import doctor, map_command
-from envedit.cli.streams import steady
 from envedit.core.errors import ConfigError
 
 
-@steady
 def main(argv: list[str] | None = None) -> int:
     """Write the map with its sun, if one was clipped; returns the exit code."""
     parser = map_command.make_parser(

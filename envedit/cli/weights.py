@@ -6,10 +6,8 @@ import sys
 from pathlib import Path
 
 from envedit.cli.console import Console, exit_code, make_parser
-from envedit.cli.streams import steady
 
 
-@steady
 def main(argv: list[str] | None = None) -> int:
     """Fetch and convert the weights; returns the exit code."""
     parser = make_parser(

@@ -52,27 +52,13 @@ def program() -> str:
 def job(
     name: str, toml: str | dict, base: FilePath = ".", version: str = "", command: Sequence[str] = ()
 ) -> Job:
-    """Make a job of a configuration.
+    """Make a job of a configuration: TOML text, or its tables; the name is any printable text.
 
-    Parameters
-    ----------
-    name : str
-        Any printable text.
-    toml : str or dict
-        The TOML text, or its tables.
-    base : path
-        Folder that relative paths start from.
-    version : str
-        Whatever else decides what comes out, such as the code of ``command``.
-    command : sequence of str
-        What carries it out in place of ``envedit run``; no part of the key.
+    Relative paths start from the folder ``base``. ``version`` is whatever else decides what comes out, such
+    as the code of ``command``, which carries it out in place of ``envedit run`` and is no part of the key.
 
-    Raises
-    ------
-    ConfigError
-        The configuration is not usable.
-    InputError
-        A file that it names cannot be read. One that does not exist is left to the run to report.
+    ConfigError if the configuration is not usable, InputError if a file that it names cannot be read. One
+    that does not exist is left to the run to report.
     """
     if not name or not name.isprintable():
         raise ConfigError(f"job {name!r}: got no printable text, expected a name")

@@ -27,7 +27,7 @@ import argparse
 import contextlib
 import functools
 import hashlib
-import importlib.util
+import inspect
 import json
 import re
 import sys
@@ -73,20 +73,23 @@ class Case:
         return sweep.job(self.name, overridden(self.tables, overrides), **how)
 
 
-def calling(name: str, function: str, tables: dict, about: dict | None = None, **arguments) -> Case:
+def calling(
+    name: str, function: Callable[..., dict], tables: dict, about: dict | None = None, **arguments
+) -> Case:
     """Make a case that calls a function in place of ``envedit run``.
 
-    ``function`` is ``package.module:name`` of a function (settings, folder, **arguments) -> dict: the metrics
-    of the case. Arguments are those of JSON. The code of its folder, and of the experiments that this imports
-    from, is part of the version.
+    The function, of a module, is (settings, folder, **arguments) -> the metrics of the case; arguments are
+    those of JSON. The code of its folder, and of the experiments that this imports from, is part of the
+    version.
     """
-    folder = Path(importlib.util.find_spec(function.partition(":")[0]).origin).parent
+    folder = Path(inspect.getfile(function)).parent
     imported = re.findall(rb"^from experiments\.(\w+)", code_of(folder), re.M)
     folders = [folder, *(Path(__file__).parent / one.decode() for one in sorted(set(imported)))]
     code = hashlib.sha256(b"".join(map(code_of, folders))).hexdigest()
+    where = f"{function.__module__}:{function.__name__}"
     given = json.dumps(arguments, sort_keys=True)
-    command = "{python}", str(Path(call.__file__).absolute()), function, "{folder}", "{threads}", given
-    return Case(name, tables, about or {}, command, f"{code} {function} {given}", call.RESULT)
+    command = "{python}", str(Path(call.__file__).absolute()), where, "{folder}", "{threads}", given
+    return Case(name, tables, about or {}, command, f"{code} {where} {given}", call.RESULT)
 
 
 @functools.cache

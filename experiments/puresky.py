@@ -42,6 +42,12 @@ def find(folder: str | Path | None = None) -> dict[str, Path]:
     return found
 
 
+def others() -> dict[str, Path]:
+    """List the maps with ground of ENVEDIT_DATA by name: those of its folder ``hdri``."""
+    folder = data("hdri/NAME_1k.hdr", "CONTRIBUTING.md lists the maps") / "hdri"
+    return {path.stem.removesuffix("_1k"): path for path in sorted(folder.glob("*_1k.hdr"))}
+
+
 def file(name: str) -> str:
     """Return the file of a map of ENVEDIT_DATA; ConfigError if there is none of this name."""
     found = find()

@@ -87,12 +87,25 @@ def run_job(
 ) -> Outcome:
     """Carry out a job unless it is done: in this thread, by a process of its own.
 
-    ``out`` is the folder of all jobs, ``command`` what is called in place of the job's own, as
-    :data:`COMMAND`. Exit code 0: done. 3 with a line that says so, after it was started with a checkpoint:
-    that is damaged or belongs to something else, and is removed for a second try. Without ``threads`` a job
-    has the cores of this machine over the jobs at a time of this Dask worker. Once ``stop`` is set, the job
-    is interrupted as by Ctrl-C and gets some seconds for its checkpoint. InputError if the folder cannot be
-    made or written to.
+    Parameters
+    ----------
+    job : Job
+        What to do.
+    out : path
+        Folder of all jobs.
+    command : sequence of str
+        What to call in place of the job's own command, as :data:`COMMAND`. Exit code 0: done. 3 with a line
+        that says so, after it was started with a checkpoint: that is damaged or belongs to something else,
+        and is removed for a second try.
+    threads : int, optional
+        Threads of the job; None: the cores of this machine over the jobs at a time of this Dask worker.
+    stop : threading.Event, optional
+        Once it is set, the job is interrupted as by Ctrl-C and gets some seconds for its checkpoint.
+
+    Raises
+    ------
+    InputError
+        If the folder cannot be made or written to.
     """
     # ---- Nothing to do, or not by this installation
     folder = job.folder(out)

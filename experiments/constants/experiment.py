@@ -144,10 +144,9 @@ def _edits():
 
 def cases(given) -> list[Case]:
     """Return the edits as they are, and those of each module."""
-    function = "experiments.constants.experiment:measured"
     modules = dict.fromkeys(one.module for one in constants())
-    changed = [calling(module, function, BASE, {}, module=module) for module in modules]
-    return [calling("as they are", function, BASE, {}), *changed]
+    changed = [calling(module, measured, BASE, {}, module=module) for module in modules]
+    return [calling("as they are", measured, BASE, {}), *changed]
 
 
 def combine(rows: list[dict]) -> list[dict]:

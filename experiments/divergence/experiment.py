@@ -139,8 +139,7 @@ def judge(scene, render, envmap, true, target, first=FRESH) -> dict:
 
 def cases(given):
     tables = {"scene": {"file": "sphere", "width": WIDTH}, "optimizer": {"lr": RATE, "iterations": STEPS}}
-    function = f"{__name__}:{estimate.__name__}"
-    return [calling(name, function, tables, {"method": name}, **how) for name, how in METHODS.items()]
+    return [calling(name, estimate, tables, {"method": name}, **how) for name, how in METHODS.items()]
 
 
 def measure(done) -> dict:

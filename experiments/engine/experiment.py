@@ -11,7 +11,7 @@ from envedit.core import shipped
 from experiments import puresky
 from experiments.harness import Experiment, calling, done_of, rows_of
 
-from . import tables
+from . import tables, timing
 
 SUNNY = "kloofendal_48d_partly_cloudy"
 ANALYTIC = {"envmap": "sunsky", "azimuth": 130, "elevation": 45}
@@ -48,7 +48,7 @@ def cases(given):
     def add(name, function, settings, about=None, **arguments):
         about = {"case": name, "section": name.partition("-")[0], "quick": quick} | (about or {})
         called = {"measuring": function, "quick": quick} | arguments
-        found.append(calling(name, "experiments.engine.timing:measured", settings, about, **called))
+        found.append(calling(name, timing.measured, settings, about, **called))
 
     def lit(pixels, texels, spp="auto", scene="sphere"):
         shown = {"file": scene, "width": pixels, "parameters": meshes.get(scene, {})}
@@ -80,12 +80,8 @@ def cases(given):
     for variable, values in ranges.items():
         for value in values:
             settings = lit(**base | {variable: value})
-            add(
-                f"scaling-{variable}-{value}",
-                "transport:measure",
-                settings,
-                {"variable": variable, "scene": "sphere"},
-            )
+            about = {"variable": variable, "scene": "sphere"}
+            add(f"scaling-{variable}-{value}", "transport:measure", settings, about)
     tiny = {"fit": {"epochs": 60}, "representation": {"kind": "siren", "hidden": 32}}
     for name, file in {"sunsky": "sunsky"}.items() if quick else maps.items():
         settings = {"representation": {"kind": "siren"}} | (tiny if quick else {})

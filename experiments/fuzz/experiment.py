@@ -4,7 +4,7 @@ Case i of a kind and of the configuration's ``seed`` is always the same file, wh
 Linux only: memory is read from /proc.
 """
 
-from experiments.fuzz.drive import FAULTS
+from experiments.fuzz.drive import FAULTS, piece
 from experiments.fuzz.kinds import KINDS
 from experiments.harness import Experiment, calling
 from experiments.summary import Summary
@@ -25,7 +25,7 @@ def cases(given):
         for first in range(0, total, PIECE):
             files = {"what": what, "first": first, "count": min(PIECE, total - first)}
             name = f"{what} {first}-{first + files['count'] - 1}"
-            found.append(calling(name, "experiments.fuzz.drive:piece", {}, {"what": what}, **files))
+            found.append(calling(name, piece, {}, {"what": what}, **files))
     return found
 
 

@@ -64,13 +64,12 @@ def room(lamps: dict[str, tuple[float, float]]) -> np.ndarray:
 
 
 def cases(args):
-    data = puresky.data("hdri/NAME_1k.hdr", how="CONTRIBUTING.md lists the maps")
+    maps = puresky.others()
     folder = make(args.out / "maps").absolute()
     rooms = {name: folder / f"{name.replace(' ', '_')}.exr" for name in ROOMS}
     for name, file in rooms.items():
         if not file.exists():
             images.write_exr(file, room(ROOMS[name]))
-    maps = {file.stem.removesuffix("_1k"): file for file in sorted((data / "hdri").glob("*_1k.hdr"))}
     made = []
     for name, file in (maps | {"room": rooms["as it is"]}).items():
         targets = {"60": {"rotate_degrees": 60}, "painted": {"kind": "strokes", "strokes": PAINT}}

@@ -62,7 +62,7 @@ def compare(settings, folder, file: str) -> dict:
 
 def cases(args):
     return [
-        calling(name, "experiments.layers.moved_lights:compare", {}, {"map": name}, file=str(file))
+        calling(name, compare, {}, {"map": name}, file=str(file))
         for name, file in sorted(puresky.find().items())
     ]
 

@@ -27,10 +27,11 @@ ASKED = 0.1
 
 def cases(args) -> list[Case]:
     scenes = {"scene": {"file": "sphere"}}
-    function = "experiments.looks.experiment:in_its_light"
     found = puresky.find().items()
     look = LOOK.read_text()
-    return [calling(name, function, scenes, {"map": name}, file=str(file), look=look) for name, file in found]
+    return [
+        calling(name, in_its_light, scenes, {"map": name}, file=str(file), look=look) for name, file in found
+    ]
 
 
 def in_its_light(settings, folder: Path, file: str, look: str) -> dict:

@@ -55,7 +55,7 @@ def case(name, line, first, second, width):
     size = f"{LARGE} x {LARGE // 2}" if width else "1024 x 512"
     about = {"command": name, "size": size, "map": Path(first).stem}
     title = f"{name.replace(', ', '-').replace(' ', '_')}-{Path(first).stem}-{width or 1024}"
-    return calling(title, "experiments.maps_alone.experiment:timed", tables, about, line=line, width=width)
+    return calling(title, timed, tables, about, line=line, width=width)
 
 
 def timed(settings, folder: Path, line: str, width: int | None) -> dict:

@@ -31,7 +31,7 @@ def measure_glow(settings, folder, file: str) -> dict:
 
 def cases(args):
     return [
-        calling(name, "experiments.natural.aureoles:measure_glow", {}, {"map": name}, file=str(file))
+        calling(name, measure_glow, {}, {"map": name}, file=str(file))
         for name, file in puresky.find().items()
     ]
 

@@ -40,7 +40,7 @@ def cases(args):
     skies = {name: str(file) for name, file in puresky.find().items()}
     names = sorted(skies)
     data = puresky.data()
-    ground = {file.stem.removesuffix("_1k"): str(file) for file in sorted((data / "hdri").glob("*_1k.hdr"))}
+    ground = {name: str(file) for name, file in puresky.others().items()}
     analytic = {e: str(args.out.absolute() / "maps" / f"sunsky_{e}.exr") for e in (ELEVATION, *ELEVATIONS)}
     make(args.out / "maps")
     for elevation, file in analytic.items():

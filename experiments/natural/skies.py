@@ -75,7 +75,7 @@ def differences(settings, folder, files: list[str]) -> dict:
 
 def cases(args):
     files = [str(file) for name, file in sorted(puresky.find().items()) if name not in KEPT]
-    return [calling("skies", "experiments.natural.skies:differences", {}, files=files)]
+    return [calling("skies", differences, {}, files=files)]
 
 
 def measure(done) -> list[dict]:

@@ -6,6 +6,7 @@ from pathlib import Path
 from envedit.core.color import tonemap
 from experiments import puresky
 from experiments.harness import Experiment, calling
+from experiments.paint import figure10
 from experiments.summary import Summary, values
 
 
@@ -15,8 +16,7 @@ def cases(given):
     for name, edit in edits.items():
         tables = {"input": {"envmap": puresky.file(edit["map"])}, "scene": {"file": edit["scene"]}}
         about = {"edit": name.replace("_", " "), "scene": edit["scene"], "map": edit["map"]}
-        function = "experiments.paint.figure10:edit"
-        made.append(calling(name, function, tables, about, strokes=edit["strokes"]))
+        made.append(calling(name, figure10.edit, tables, about, strokes=edit["strokes"]))
     return made
 
 

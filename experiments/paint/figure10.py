@@ -208,10 +208,9 @@ def cases(given):
         shipped = Path(__file__).parents[2] / "scenes/edits" / f"{name}.toml"
         asked = tomllib.loads(shipped.read_text())
         tables, strokes = {"input": {"envmap": sky}, "scene": asked["scene"]}, asked["target"]["strokes"]
-        function = "experiments.paint.figure10:edit"
-        found.append(calling(name, function, tables, {"edit": title}, strokes=strokes))
+        found.append(calling(name, edit, tables, {"edit": title}, strokes=strokes))
         if name == "move_shadow":
-            page = calling("page", "experiments.paint.figure10:picture", tables, strokes=strokes)
+            page = calling("page", picture, tables, strokes=strokes)
     return [*found, page]
 
 

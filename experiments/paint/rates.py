@@ -93,7 +93,7 @@ def cases(given):
     return [
         calling(
             name,
-            f"{__name__}:{rates.__name__}",
+            rates,
             {"input": {"envmap": "sunsky"}, "scene": {"file": "sphere", "width": pixels}},
             texels=texels,
         )

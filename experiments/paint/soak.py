@@ -168,7 +168,7 @@ def draw(cases, out, to, given):
 
 def cases(given):
     tables = {"input": {"envmap": "sunsky"}, "scene": {"file": "sphere", "width": 128}}
-    return [calling("soak", f"{__name__}:{soak.__name__}", tables, minutes=given.minutes)]
+    return [calling("soak", soak, tables, minutes=given.minutes)]
 
 
 EXPERIMENT = Experiment(

@@ -60,8 +60,7 @@ def cases(args):
             "scene": {"width": WIDTH, **files.get(scene, {"file": scene})},
         }
         about = {"edit": edit, "scene": scene, "map": name}
-        function = "experiments.painted_edits.artists:carry_out"
-        made.append(calling(f"{edit}-{scene}-{name}".replace(" ", "_"), function, tables, about, edit=edit))
+        made.append(calling(f"{edit}-{scene}-{name}".replace(" ", "_"), carry_out, tables, about, edit=edit))
     made = [case for case in made if not args.only or any(text in case.name for text in args.only)]
     return made if args.count is None else evenly(made, args.count)
 

@@ -12,7 +12,7 @@ import numpy as np
 from envedit import config
 from envedit.core.resampling import fit
 from envedit.images import images
-from envedit.scene import scene as scenes
+from experiments import plain_mitsuba
 
 STEPS, SPP, RATE = 150, 16, 0.05
 
@@ -25,19 +25,8 @@ def edited_by_adam(settings: config.Config, envmap: np.ndarray, photo: Path) -> 
     """
     # ---- Scene and target
     chosen = settings.scene
-    images.write_exr(photo.with_name("start.exr"), envmap)
-    text = scenes.relit(chosen.file, "start.exr", dict(chosen.parameters), None, chosen.up, 1.0)
     file = photo.with_name("start.xml")
-    file.write_text(text, encoding="utf-8")
-    threads = dr.thread_count()
-    dr.set_thread_count(max(2, threads))  # with one, Mitsuba's loader waits for ever
-    scene = mi.load_file(str(file))
-    dr.set_thread_count(threads)
-    params = mi.traverse(scene)
-    size = next(name for name, *_ in params if name.endswith("film.size"))
-    params[size] = mi.ScalarVector2u(chosen.width, chosen.width)
-    params[size.replace("film.size", "film.crop_size")] = mi.ScalarVector2u(chosen.width, chosen.width)
-    params.update()
+    scene, params = plain_mitsuba.loaded(chosen, envmap, file, chosen.width, chosen.width)
     target = mi.TensorXf(fit(images.read(str(photo))[0], chosen.width, chosen.width))
     target *= dr.mean(mi.render(scene, spp=64).array) / dr.mean(target.array)
 

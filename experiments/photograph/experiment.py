@@ -40,6 +40,8 @@ LINEAR, KNOWN, ADAM = "linear", "filmic, +1 stops, 5500 K, both given", "Adam on
 Mitsuba's path tracer and Adam, on the first camera's."""
 OF_WAY = {KNOWN: 2, ADAM: 0}
 """The number of their camera."""
+NAMES = {KNOWN: "known", ADAM: "adam"}
+"""What the names of their cases say."""
 
 
 def options(parser):
@@ -56,7 +58,6 @@ def cases(given):
     for i, name in enumerate(names):
         other = names[(i + FARTHER) % len(names)]
         ways = [LINEAR, *range(len(CAMERAS)), KNOWN, ADAM]
-        names_of = {KNOWN: "known", ADAM: "adam"}
         for k, (scene, way) in enumerate(itertools.product(SCENES, ways)):
             if given.maps and name not in given.maps:
                 continue
@@ -71,17 +72,9 @@ def cases(given):
             camera = CAMERAS[way] if isinstance(way, int) else None
             label = f"{camera.curve}, {camera.stops:+g} stops, {camera.kelvin:g} K" if camera else way
             about = {"scene": scene, "map": name, "other": other, "camera": label}
-            made.append(
-                calling(
-                    f"{scene}-{name}-{other}-{names_of.get(way, way)}",
-                    "experiments.photograph.experiment:edited",
-                    tables,
-                    about,
-                    other=str(maps[other]),
-                    way=way,
-                    seed=SEED + 100 * i + k,
-                )
-            )
+            title = f"{scene}-{name}-{other}-{NAMES.get(way, way)}"
+            how = {"other": str(maps[other]), "way": way, "seed": SEED + 100 * i + k}
+            made.append(calling(title, edited, tables, about, **how))
     return sorted(made, key=lambda case: case.about["camera"] in (LINEAR, KNOWN, ADAM))
 
 

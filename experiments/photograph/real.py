@@ -22,6 +22,7 @@ from envedit.core.resampling import fit
 from envedit.images import images
 from envedit.results import Result
 from experiments import puresky
+from experiments.harness import montage
 from experiments.photograph import insertion
 
 WHEEL = "scikit-image==0.26.0"
@@ -81,11 +82,8 @@ def draw(folder: Path) -> None:
             tonemap(one / 4, "gamma") for one in (studio, images.read(folder / name / "edited.exr")[0])
         ]
         pictures += [images.read_stored(folder / "inserted.png")[0] / 255] if name == "coffee" else []
-        rows.append(np.concatenate([scaled(one) for one in pictures], axis=1))
-    width = max(row.shape[1] for row in rows)
-    sheet = np.concatenate([np.pad(row, ((0, 3), (0, width - row.shape[1]), (0, 0))) for row in rows])
-    pixels = np.rint(255 * np.clip(sheet, 0, 1)).astype(np.uint8)
-    mi.Bitmap(pixels).write(str(folder / "sheet.jpg"), quality=85)
+        rows.append([scaled(one) for one in pictures])
+    mi.Bitmap(montage(rows)).write(str(folder / "sheet.jpg"), quality=85)
 
 
 def prepare(folder: Path) -> None:

@@ -7,7 +7,6 @@ Mitsuba renders of the scene as its author has it, with its filter and other sam
 import itertools
 from dataclasses import replace
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -15,8 +14,7 @@ import envedit
 from envedit import config, inputs
 from envedit.core.color import tonemap
 from envedit.images import images
-from envedit.scene import scene as scenes
-from experiments import puresky
+from experiments import plain_mitsuba, puresky
 from experiments.harness import Done, Experiment, calling, markdown, number
 from experiments.natural.experiment import picked, psnr
 
@@ -70,7 +68,7 @@ def cases(given):
         kind = "turned" if "rotate_degrees" in target else "another map"
         about = {"scene": scene, "map": name, "target": label, "kind": kind}
         title = f"{scene}-{name}-{label}".replace(" ", "_")
-        found.append(calling(title, "experiments.pictures.experiment:three_ways", tables, about))
+        found.append(calling(title, three_ways, tables, about))
     return picked(found, given, ("kind", "scene"))
 
 
@@ -111,20 +109,9 @@ def write_png(settings, folder, true, file) -> None:
 
     The map is in the units of the radiance that reaches the scene.
     """
-    chosen = settings.scene
-    images.write_exr(folder / "true.exr", true)
-    text = scenes.relit(chosen.file, "true.exr", dict(chosen.parameters), None, chosen.up, 1.0)
-    (folder / "true.xml").write_text(text, encoding="utf-8")
-    threads = dr.thread_count()
-    dr.set_thread_count(max(2, threads))  # with one, Mitsuba's loader waits for ever
-    scene = mi.load_file(str(folder / "true.xml"))
-    dr.set_thread_count(threads)
-    size = inputs.load_scene(chosen)
-    film = mi.traverse(scene)
-    key = next(name for name, *_ in film if name.endswith("film.size"))
-    film[key] = mi.ScalarVector2u(size.width, size.height)
-    film[key.replace("film.size", "film.crop_size")] = mi.ScalarVector2u(size.width, size.height)
-    film.update()
+    size = inputs.load_scene(settings.scene)
+    file_of_scene = folder / "true.xml"
+    scene, _ = plain_mitsuba.loaded(settings.scene, true, file_of_scene, size.width, size.height)
     rendering = mi.Bitmap(mi.render(scene, spp=PNG_SPP, seed=PNG_SEED))
     shown = rendering.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.UInt8, srgb_gamma=True)
     shown.write(str(file))

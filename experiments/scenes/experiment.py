@@ -46,7 +46,7 @@ def cases(given):
     for file in files:
         name = str(file.relative_to(given.folder.absolute()))
         own = tables | {"scene": tables["scene"] | {"file": str(file)}}
-        found.append(calling(name, "experiments.scenes.experiment:tried", own, {"scene": name}))
+        found.append(calling(name, tried, own, {"scene": name}))
     return found
 
 

@@ -41,7 +41,7 @@ def case(group, name, edit, pixels=128, texels=256):
         "target": {"rotate_degrees": float(target)} if target.isdigit() else {"file": str(files[target])},
         "representation": {"turn": "auto" if turn else False},
     }
-    return calling(name, "experiments.solver.edits:second", tables, {"group": group, "edit": name})
+    return calling(name, second, tables, {"group": group, "edit": name})
 
 
 def cases(given):

@@ -13,6 +13,7 @@ from experiments.harness import Done, Experiment, calling
 from experiments.summary import Numbers, Value, values
 
 from . import plan
+from .cell import cell
 
 MOST_PSNR = 55.0
 """Most dB of a rendering that are shown: beyond, the estimate without noise may itself be noise (57 dB for
@@ -27,13 +28,7 @@ PARTS = {
 
 def cases(given):
     return [
-        calling(
-            f"{name}, {scene}",
-            "experiments.tradeoff.cell:cell",
-            tables,
-            {"cell": f"{name}, {scene}"},
-            **{"scene": scene, "sets": given.sets},
-        )
+        calling(f"{name}, {scene}", cell, tables, {"cell": f"{name}, {scene}"}, scene=scene, sets=given.sets)
         for (name, scene), tables in plan.cells().items()
     ]
 

@@ -43,8 +43,7 @@ def measure_sun(settings, folder, file: str, map_name: str) -> dict:
 def cases(args):
     maps = {name: str(file) for name, file in puresky.find().items() if name in CLEAR + LOW}
     return [
-        calling(name, "experiments.unclip.constants:measure_sun", {}, {"map": name}, file=file, map_name=name)
-        for name, file in maps.items()
+        calling(name, measure_sun, {}, {"map": name}, file=file, map_name=name) for name, file in maps.items()
     ]
 
 

@@ -79,18 +79,10 @@ def measure_map(settings, folder, file: str, map_name: str) -> dict:
 
 
 def cases(args):
-    hdri = puresky.data() / "hdri"
     maps = [(name, file, GROUPS[name in clipping.KEPT]) for name, file in puresky.find().items()]
-    maps += [(file.name[:-7], file, GROUPS[2]) for file in sorted(hdri.glob("*_1k.hdr"))]
+    maps += [(name, file, GROUPS[2]) for name, file in puresky.others().items()]
     return [
-        calling(
-            name,
-            "experiments.unclip.experiment:measure_map",
-            {},
-            {"map": name, "set": of},
-            file=str(file),
-            map_name=name,
-        )
+        calling(name, measure_map, {}, {"map": name, "set": of}, file=str(file), map_name=name)
         for name, file, of in maps
     ]
 

@@ -86,8 +86,7 @@ def seeds_of(settings, folder, times):
 
 
 def calling(times=2, tables=None):
-    name = f"{__name__}:{seeds_of.__name__}"
-    return harness.calling("call", name, tables or {"seed": 5}, {"what": "x"}, times=times)
+    return harness.calling("call", seeds_of, tables or {"seed": 5}, {"what": "x"}, times=times)
 
 
 @pytest.mark.slow

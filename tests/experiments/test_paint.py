@@ -37,7 +37,7 @@ def test_the_six_edits_and_the_picture_of_the_page(tmp_path, monkeypatch):
 
 
 def test_the_picture_of_the_page_is_a_sheet_of_its_own(tmp_path):
-    done = Done(calling("page", "experiments.paint.figure10:picture", {}), tmp_path)
+    done = Done(calling("page", figure10.picture, {}), tmp_path)
     images.write_png(tmp_path / "page.png", np.full((4, 6, 3), 0.5, np.float32))
     (panel,) = figure10.panels(done)
     assert panel.shape == (4, 6, 3) and figure10.EXPERIMENT.sheet(done.case) == "page"

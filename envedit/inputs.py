@@ -72,10 +72,7 @@ class InputMap:
     def radiance(self) -> np.ndarray:
         """Linear radiance (H, W, 3) float32 that reaches the scene, in Rec. 709; no channel is negative.
 
-        Raises
-        ------
-        InputError
-            It is more than :data:`.radiance.BRIGHTEST` somewhere.
+        InputError if it is more than :data:`.radiance.BRIGHTEST` somewhere.
         """
         colours = self._in_rec709
         if self.chromaticities is not None:
@@ -108,17 +105,8 @@ class InputMap:
     def as_stored(self, edited: np.ndarray, degrees: float = 0.0) -> np.ndarray:
         """Return an edited map in the units of the file; a texel that was not edited keeps its bits.
 
-        Parameters
-        ----------
-        edited : ndarray (H, W, 3)
-            Linear radiance in the scene.
-        degrees : float
-            By how much the map was turned before it was edited.
-
-        Raises
-        ------
-        NumericalError
-            A value is too large for the file: ``scale`` is too small.
+        ``edited`` is linear radiance (H, W, 3) in the scene; the map was turned by ``degrees`` before it was
+        edited. NumericalError if a value is too large for the file, as ``scale`` is too small.
         """
         if self.scale == 1 and self.chromaticities is None:
             return edited
@@ -149,12 +137,8 @@ def scaled(stored: np.ndarray, scale: float, source: str) -> np.ndarray:
 def source_of(settings: config.Input, scene: Scene | None) -> str:
     """Return the file of a configuration's map, "sunsky", or "scene" for a light of its own that is no file.
 
-    Raises
-    ------
-    ConfigError
-        The scene's own light is asked for, and there is no scene, or it is made for any map.
-    InputError
-        The scene has none, or its file is not there.
+    Where the scene's own light is asked for, ConfigError if there is no scene or it is made for any map,
+    InputError if it has none or its file is not there.
     """
     if settings.envmap not in (AUTO, SCENE):
         return settings.envmap
@@ -182,12 +166,8 @@ def read_map(
     """Read the map of a configuration, or take it from an ``array`` (H, 2 H, 3).
 
     ``scene`` is what its own light and scale are taken from; without one the scale is 1. The map has
-    ``width`` texels across, by default as many as its file (one that is made: the working width).
-
-    Raises
-    ------
-    ConfigError, InputError
-        As of :func:`source_of` and :func:`.images.load_envmap`.
+    ``width`` texels across, by default as many as its file (one that is made: the working width). Errors are
+    those of :func:`source_of` and :func:`.images.load_envmap`.
     """
     scale = 1.0 if scene is None else scene.own.scale
     if array is not None:
@@ -237,12 +217,8 @@ def read_file(source: str | np.ndarray, width: int | None, settings: config.Inpu
     """Read a map from its file, or take it from an array (H, 2 H, 3).
 
     It has ``width`` texels across, by default as many as the file; ``scale`` is what the scene multiplies it
-    by. Of the settings ``repair``, ``unclip`` and ``colour_space`` count.
-
-    Raises
-    ------
-    InputError
-        As of :func:`.images.load_envmap`.
+    by. Of the settings ``repair``, ``unclip`` and ``colour_space`` count. Errors are those of
+    :func:`.images.load_envmap`.
     """
     stored, info = images.load_envmap(
         source,

@@ -56,12 +56,7 @@ def make(
 def check(settings: config.Config, scene: Scene, shape: tuple[int, int]) -> None:
     """Refuse, before anything is rendered, what :func:`make` will refuse.
 
-    Raises
-    ------
-    ConfigError
-        A path tracer is asked for several views.
-    InputError
-        T does not fit into memory.
+    ConfigError if a path tracer is asked for several views, InputError if T does not fit into memory.
     """
     chosen = settings.renderer
     if chosen.kind == "path" and len(scene.views) > 1:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import os
 from pathlib import Path
 
@@ -98,13 +97,13 @@ def _write(arguments):
 
 def _file_name(option, value, names, kind, folder):
     """Return what a configuration in a folder calls a file: a bare name as it is, a path relative to it."""
+    from envedit.config.validators import meant
     from envedit.core.errors import InputError
 
     if value in names:
         return value
     if not os.path.isfile(value):
-        close = difflib.get_close_matches(value, names, 1)
-        hint = f"did you mean {close[0]}?" if close else "check the path"
+        hint = meant(value, names, "check the path")
         raise InputError(
             f"{option}: got {value}: no such file; expected {kind}, or {', '.join(names)}; {hint}"
         )

@@ -57,10 +57,14 @@ def load(name: str, preset: str | None, overrides: Iterable[str]) -> tuple[confi
         return config.loads("", Path.cwd(), label, preset, overrides), None, Path.cwd()
     by_name = None if os.path.isfile(name) else shipped.configuration(name)
     file = by_name or Path(name)
-    if _missing(file):
+    try:
+        os.stat(file)
+    except FileNotFoundError:
         close = difflib.get_close_matches(name, shipped.configurations(), 1)
         hint = f"did you mean the shipped {close[0]}?" if close else "to write one: envedit init"
-        raise ConfigError(f"{name}: no such configuration file; {hint}")
+        raise ConfigError(f"{name}: no such configuration file; {hint}") from None
+    except (OSError, ValueError):  # reading it will explain
+        pass
     if shipped.holds(file):
         results = Path.cwd() / "runs" / file.stem
         overrides = [f"output.dir={config.quote(str(results))}", *overrides]
@@ -75,17 +79,6 @@ def scene_name(file: Path) -> str:
     name = file.stem or "scene"
     folder = file.absolute().parent
     return f"{folder.name}_{name}" if name == "scene" and folder != Path.cwd() and folder.name else name
-
-
-def _missing(file):
-    """Return whether a file is missing; False where it cannot be looked at, which reading it will explain."""
-    try:
-        os.stat(file)
-    except FileNotFoundError:
-        return True
-    except (OSError, ValueError):
-        pass
-    return False
 
 
 def _run(arguments, console, begun):

@@ -109,8 +109,8 @@ class LightList(Tables):
     def _entry(self, name: str, light: dict[str, Any]) -> dict[str, Any]:
         keys = OWN if "light" in light else ADDED
         for unknown in (k for k in light if k not in keys):
-            hint = meant(str(unknown), keys)
-            hint = hint if hint.startswith("did") else f"known: {', '.join(dict.fromkeys(['light', *keys]))}"
+            known = ", ".join(dict.fromkeys(["light", *keys]))
+            hint = meant(unknown, keys, f"known: {known}")
             raise ConfigError(f"{name}: has no key {show(unknown)}; {hint}")
         found = {
             key: named(f"{name}.{key}", check, light[key]) for key, check in keys.items() if key in light

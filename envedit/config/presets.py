@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from envedit.config.tables import checked
-from envedit.config.validators import show
+from envedit.config.validators import meant, show
 from envedit.core.errors import ConfigError
 
 Fields = dict[str, Any]
@@ -111,12 +111,10 @@ def _unknown(key: Any, table: str, top: Fields, tables: dict[str, Fields]) -> st
     text = key[:60] if isinstance(key, str) else ""
     shown = key if text == key and re.fullmatch(r"[\w-]{1,60}", text) else show(key)
     kind = f"[{table}] has no key {shown}" if table else f"unknown table or key {shown}"
-    if close := difflib.get_close_matches(text, own, 1):
-        return f"{kind}; did you mean {close[0]}?"
     elsewhere = {k: f"{name}.{k}" for name, keys in tables.items() for k in keys} | {k: k for k in top}
-    if close := difflib.get_close_matches(text, elsewhere, 1, 0.8):
-        return f"{kind}; did you mean {elsewhere[close[0]]}?"
-    return f"{kind}; known: {', '.join(own)}"
+    close = difflib.get_close_matches(text, elsewhere, 1, 0.8)
+    hint = f"did you mean {elsewhere[close[0]]}?" if close else None
+    return f"{kind}; {meant(key, own, hint)}"
 
 
 def overlaid(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:

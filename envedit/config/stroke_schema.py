@@ -31,6 +31,8 @@ _FURTHEST = 1e6
 _COORDINATE = Number(-_FURTHEST, _FURTHEST)
 _LENGTH = Number(0, _FURTHEST, positive=True)
 _POINT = Numbers(_COORDINATE, _COORDINATE)
+_ELLIPSE = _COORDINATE, _COORDINATE, _LENGTH, _LENGTH, Number(-360, 360)
+_CORNERS = Numbers(*4 * [_COORDINATE])
 _LINEAR = Numbers(*3 * [Number(0, 1e6)])
 
 
@@ -66,16 +68,13 @@ class Ellipse(Check):
     def _take(self, value: Any) -> list[float]:
         if not isinstance(value, list | tuple) or len(value) not in (4, 5):
             raise WantedError(str(self))
-        return Numbers(*self._parts()[: len(value)])(value)
+        return Numbers(*_ELLIPSE[: len(value)])(value)
 
     def __str__(self) -> str:
         return self.range
 
-    def _parts(self) -> tuple[Check, ...]:
-        return _COORDINATE, _COORDINATE, _LENGTH, _LENGTH, Number(-360, 360)
-
     def _schema(self) -> Schema:
-        return Numbers(*self._parts()).schema() | {"minItems": 4}
+        return Numbers(*_ELLIPSE).schema() | {"minItems": 4}
 
 
 @dataclass(frozen=True)
@@ -88,7 +87,7 @@ class Rectangle(Check):
     def _take(self, value: Any) -> list[float]:
         if not isinstance(value, list | tuple) or len(value) != 4:
             raise WantedError(str(self))
-        x0, y0, x1, y1 = Numbers(*4 * [_COORDINATE])(value)
+        x0, y0, x1, y1 = _CORNERS(value)
         if x1 <= x0 or y1 <= y0:
             raise WantedError(str(self))
         return [x0, y0, x1, y1]
@@ -97,7 +96,7 @@ class Rectangle(Check):
         return "[x0, y0, x1, y1] with x1 above x0 and y1 above y0"
 
     def _schema(self) -> Schema:
-        return Numbers(*4 * [_COORDINATE]).schema()
+        return _CORNERS.schema()
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ import contextlib
 import difflib
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from numbers import Integral, Real
 from os import PathLike, fspath
@@ -164,8 +164,8 @@ class Choice(Check):
     def _take(self, value: Any) -> str:
         if isinstance(value, str) and (value in self.names or value in self._added):
             return value
-        close = difflib.get_close_matches(value[:60], self.names, 1) if isinstance(value, str) else ()
-        raise WantedError(f"{self}{f'; did you mean {close[0]}?' if close else ''}")
+        hint = meant(value, self.names, "")
+        raise WantedError(f"{self}; {hint}" if hint else str(self))
 
     def __str__(self) -> str:
         return f"one of {', '.join([*self.names, *self._added])}"
@@ -390,8 +390,10 @@ def show(value: Any) -> str:
     return text if len(text) <= 60 else text[:57] + "..."
 
 
-def meant(key: Any, known: Any) -> str:
-    """Say which of some names is meant, or which there are."""
-    text = key[:60] if isinstance(key, str) else ""
-    close = difflib.get_close_matches(text, list(known), 1)
-    return f"did you mean {close[0]}?" if close else f"known: {', '.join(known)}"
+def meant(key: Any, known: Iterable[str], otherwise: str | None = None) -> str:
+    """Say which of some names is meant, or ``otherwise``, by default which there are."""
+    names = list(known)
+    close = difflib.get_close_matches(key[:60] if isinstance(key, str) else "", names, 1)
+    if close:
+        return f"did you mean {close[0]}?"
+    return f"known: {', '.join(names)}" if otherwise is None else otherwise

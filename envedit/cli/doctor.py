@@ -33,7 +33,6 @@ from types import ModuleType
 from typing import Any
 
 from envedit.cli.streams import steady
-from envedit.core.array_cache import cache_home
 from envedit.core.atomic_files import opened, write_atomically
 from envedit.core.errors import InputError, MachineError
 from envedit.core.processor import cores
@@ -218,6 +217,8 @@ def _version(package: str) -> str | None:
 
 def _memory(variant: str) -> Path | None:
     """Return the file that remembers a success for this variant, these packages and these libraries."""
+    from envedit.core.array_cache import cache_home  # with numpy
+
     libraries = sorted(name for pattern in _LIBRARIES for name in glob.glob(pattern))
     parts = [variant, sys.version, sys.executable, _version("mitsuba"), _version("drjit"), libraries]
     parts += [os.environ.get(name) for name in ("DRJIT_LIBLLVM_PATH", "LD_LIBRARY_PATH")]

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from envedit.cli.console import Console, exit_code, make_parser
 from envedit.core import shipped
+from envedit.core.errors import ConfigError, InputError
 
 # Lines of "setting  # comment"; the comments are aligned when the settings are known.
 TEMPLATE = """\
@@ -74,7 +75,6 @@ def main(argv: list[str] | None = None) -> int:
 def _write(arguments):
     from envedit import config
     from envedit.core.atomic_files import write_atomically
-    from envedit.core.errors import ConfigError
 
     file = Path(arguments.out)
     if os.path.lexists(file):
@@ -98,7 +98,6 @@ def _write(arguments):
 def _file_name(option, value, names, kind, folder):
     """Return what a configuration in a folder calls a file: a bare name as it is, a path relative to it."""
     from envedit.config.validators import meant
-    from envedit.core.errors import InputError
 
     if value in names:
         return value

@@ -19,6 +19,7 @@ from envedit.cli import doctor, run_options
 from envedit.cli.console import Console, exit_code
 from envedit.cli.streams import steady
 from envedit.core import shipped
+from envedit.core.errors import ConfigError, InputError
 
 if TYPE_CHECKING:
     from envedit import config
@@ -48,7 +49,6 @@ def load(name: str, preset: str | None, overrides: Iterable[str]) -> tuple[confi
     Results of a shipped configuration go to ``runs/NAME`` in the working folder.
     """
     from envedit import config
-    from envedit.core.errors import ConfigError
 
     if run_options.is_scene(name):
         file = Path(name)
@@ -83,7 +83,6 @@ def scene_name(file: Path) -> str:
 
 def _run(arguments, console, begun):
     from envedit import config
-    from envedit.core.errors import ConfigError
     from envedit.report import output_folder
 
     # ---- Configuration
@@ -268,7 +267,6 @@ def _dry_run(settings, base, console):
 def _check_same(settings, folder):
     """Refuse to call the run in a folder complete when it was asked for something else."""
     from envedit import config
-    from envedit.core.errors import ConfigError, InputError
     from envedit.losses.perceptual import installed
     from envedit.report import manifest
 

@@ -8,6 +8,7 @@ import re
 
 from envedit.cli import console
 from envedit.core import shipped
+from envedit.core.errors import ConfigError
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -136,7 +137,6 @@ def quick(arguments: argparse.Namespace) -> list[str]:
     ConfigError where they are given beside a configuration, which says the same.
     """
     from envedit import config
-    from envedit.core.errors import ConfigError
 
     keys = {
         "envmap": (("input.envmap", arguments.envmap),),
@@ -157,8 +157,6 @@ def quick(arguments: argparse.Namespace) -> list[str]:
 
 def seconds(text: str) -> float:
     """Read --budget."""
-    from envedit.core.errors import ConfigError
-
     match = re.fullmatch(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*(s|sec|m|min|)\s*", text)
     value = float(match[1]) * (60 if match[2].startswith("m") else 1) if match else 0
     if not 0 < value < 1e6:

@@ -1,8 +1,10 @@
 """``python -m experiments NAME run|table|sheet``: the experiments on :mod:`experiments.harness`."""
 
 import importlib
+import inspect
 import sys
 from pathlib import Path
+from types import ModuleType
 
 from experiments import harness
 
@@ -15,6 +17,11 @@ def modules() -> dict[str, str]:
     return {name: f"experiments.{'.'.join(one)}" for name, one in sorted(zip(names, found, strict=True))}
 
 
+def about(module: ModuleType) -> str:
+    """Return the first line of what a module says of itself."""
+    return inspect.getdoc(module).splitlines()[0]
+
+
 def main(argv=None) -> int:
     """Run an experiment by name; returns the exit code."""
     given, known = sys.argv[1:] if argv is None else argv, modules()
@@ -22,13 +29,14 @@ def main(argv=None) -> int:
         print("python -m experiments NAME run|table|sheet: compute, print the table, draw the sheets\n")
         width = max(map(len, known))
         for name, module in known.items():
-            print(f"  {name:<{width}}  {importlib.import_module(module).EXPERIMENT.description}")
+            print(f"  {name:<{width}}  {about(importlib.import_module(module))}")
         return 0
     if not given or given[0] not in known:
         got = f"got {given[0]}" if given else "got no name"
         print(f"python -m experiments NAME ...: {got}, expected one of {', '.join(known)}", file=sys.stderr)
         return 2
-    return harness.main(importlib.import_module(known[given[0]]).EXPERIMENT, given[1:])
+    module = importlib.import_module(known[given[0]])
+    return harness.main(given[0], about(module), module.EXPERIMENT, given[1:])
 
 
 if __name__ == "__main__":

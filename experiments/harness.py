@@ -8,8 +8,6 @@ interrupted continues, and results of another configuration or version are never
 .. code-block:: python
 
    EXPERIMENT = Experiment(
-       "turned",
-       "Turn maps by 60 degrees.",
        cases=lambda given: [
            Case(name, {"input": {"envmap": str(file)}, "target": {"rotate_degrees": 60}}, {"map": name})
            for name, file in puresky.find().items()
@@ -161,8 +159,6 @@ def edit_panels(done: Done) -> list[np.ndarray]:
 class Experiment:
     """What is run, measured and shown."""
 
-    name: str  # of its command
-    description: str  # a line
     cases: Callable[[argparse.Namespace], list[Case]]  # of the parsed command line
     # A row of numbers, or several; with the case's ``about``, the columns are made of them
     measure: Callable[[Done], dict | list[dict]] = lambda done: done.metrics
@@ -317,30 +313,28 @@ def make(folder: Path) -> Path:
     return folder
 
 
-def main(experiment: Experiment, argv: Sequence[str] | None = None) -> int:
-    """Run an experiment's command line; returns the exit code.
+def main(name: str, about: str, experiment: Experiment, argv: Sequence[str] | None = None) -> int:
+    """Run the command line of an experiment of a name, which its help says about; returns the exit code.
 
     0; 1 if a case is not done; 2, 3 as ``envedit run``; 130 interrupted.
     """
-    parser = argparse.ArgumentParser(
-        prog=f"python -m experiments {experiment.name}", description=experiment.description
-    )
+    parser = argparse.ArgumentParser(prog=f"python -m experiments {name}", description=about)
     parser.add_argument(
         "action",
         choices=("run", "table", "sheet"),
         help="compute what is missing and print the table; print the table; draw the contact sheets",
     )
-    add_options(parser, Path("runs") / experiment.name)
+    add_options(parser, Path("runs") / name)
     parser.add_argument("--to", type=Path, metavar="DIR", help="of table.md and sheets (that of the runs)")
     experiment.options(parser)
     given = parser.parse_args(argv)
     options.check_options(parser, given)
     if experiment.alone and not given.scheduler:
         given.workers = given.workers or 1
-    return options.exit_code(experiment.name, lambda: _act(experiment, given))
+    return options.exit_code(name, lambda: _act(name, experiment, given))
 
 
-def _act(experiment, given):
+def _act(name, experiment, given):
     mi.set_variant(config.Config().variant)
     out = given.out.absolute()
     chosen = [
@@ -350,7 +344,7 @@ def _act(experiment, given):
     ]
     if not chosen:
         got = f"--only {' '.join(given.only)}: " if given.only else ""
-        raise ConfigError(f"{got}no case of {experiment.name} is left; give other options")
+        raise ConfigError(f"{got}no case of {name} is left; give other options")
     cases, missing = [(case, case.job(given.sets)) for case in chosen], []
     if given.action == "run":
         outcomes = carry_out(cases, out, given, sys.stderr)
@@ -364,7 +358,7 @@ def _act(experiment, given):
     if given.action == "sheet":
         draw = experiment.draw
         if not draw and experiment.panels is edit_panels and cases[0][0].result == call.RESULT:
-            raise ConfigError(f"there is no sheet of {experiment.name}; give run or table")
+            raise ConfigError(f"there is no sheet of {name}; give run or table")
         if not done:
             raise InputError(f"{out}: {NOTHING}")
         print("\n".join(map(str, draw(cases, out, to, given) if draw else sheets(experiment, done, to))))

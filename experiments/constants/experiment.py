@@ -182,8 +182,6 @@ def _changes(change):
 
 
 EXPERIMENT = Experiment(
-    "constants",
-    __doc__.splitlines()[0],
     cases=cases,
     measure=lambda done: done.metrics["rows"],
     combine=combine,

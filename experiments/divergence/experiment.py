@@ -192,8 +192,6 @@ def draw(made, out, to, given):
 
 
 EXPERIMENT = Experiment(
-    "divergence",
-    "Estimate a map by Adam on its texels: path tracing and stored transport side by side.",
     cases,
     measure,
     {

@@ -91,8 +91,6 @@ def cases(given):
 
 
 EXPERIMENT = Experiment(
-    "engine",
-    "Measure the engine beside the machine's own floors.",
     cases,
     tables.measure,
     tables.COLUMNS,

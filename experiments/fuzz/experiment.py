@@ -46,8 +46,6 @@ def failures(rows: list[dict]) -> list[str]:
 
 
 EXPERIMENT = Experiment(
-    "fuzz",
-    "Damage files of every kind that the package reads, and see that reading them ends well.",
     cases,
     measure,
     summary=Summary(

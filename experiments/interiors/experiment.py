@@ -125,8 +125,6 @@ def panels(done: Done):
 
 
 EXPERIMENT = Experiment(
-    "interiors",
-    "Edit maps with several lights: which of them moved, and which stayed.",
     cases,
     measure,
     {

@@ -104,8 +104,6 @@ COLUMNS = {
 
 
 EXPERIMENT = Experiment(
-    "layers",
-    "Turn real maps by 60 and by 140 degrees, layers and robust SIREN on the same work.",
     cases,
     measure,
     COLUMNS,

@@ -83,8 +83,6 @@ def columns(statistic: str = "") -> dict[str, str]:
 
 
 EXPERIMENT = Experiment(
-    "layers.moved_lights",
-    "Move the lights of a map without any rendering, against the map turned as a whole.",
     cases,
     measure,
     {"map": "{map}"} | columns(),

@@ -133,8 +133,6 @@ def panels(done: Done):
 
 
 EXPERIMENT = Experiment(
-    "light_estimation",
-    "Judge edits by the evaluator of light estimation, beside published numbers.",
     cases,
     measure,
     COLUMNS,

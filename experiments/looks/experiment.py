@@ -101,8 +101,6 @@ def panels(done: Done) -> list[np.ndarray]:
 
 
 EXPERIMENT = Experiment(
-    "looks",
-    "Apply the look of one edit to other maps: is their key light as the look says?",
     cases,
     columns={
         "map": "{map}",

@@ -99,8 +99,6 @@ def failures(rows: list[dict]) -> list[str]:
 
 
 EXPERIMENT = Experiment(
-    "maps_alone",
-    "Time the commands on a map alone, and measure their memory.",
     cases,
     measure,
     summary=Summary(

@@ -46,8 +46,6 @@ def summary(rows) -> str:
 
 
 EXPERIMENT = Experiment(
-    "natural.aureoles",
-    "Measure how the glow of a sun goes with its flux.",
     cases,
     lambda done: [done.metrics] if done.metrics else [],
     {"map": "{map}", "flux over sky": "{flux:.2f}"}

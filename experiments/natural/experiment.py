@@ -159,8 +159,6 @@ GROUPS = {"target": "{kind}", "turn": "{turn}"}, {"scene": "{scene}"}, {"map": "
 
 
 EXPERIMENT = Experiment(
-    "natural",
-    "Edit many skies in many scenes, and measure whether the results still look like photographs of a sky.",
     cases,
     measure,
     COLUMNS,

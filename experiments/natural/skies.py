@@ -83,8 +83,6 @@ def measure(done) -> list[dict]:
 
 
 EXPERIMENT = Experiment(
-    "natural.skies",
-    "Measure how much photographed skies differ, which the prior of painted targets follows.",
     cases,
     measure,
     {

@@ -28,8 +28,6 @@ def panels(done):
 
 
 EXPERIMENT = Experiment(
-    "paint.artists",
-    "Twelve edits that lighting artists make, each painted in the page.",
     cases,
     lambda done: values(done.metrics),
     {

@@ -225,8 +225,6 @@ def panels(done: Done):
 
 
 EXPERIMENT = Experiment(
-    "paint.figure10",
-    "The six edits of the paper's Figure 10, each painted in the page.",
     cases,
     lambda done: [] if done.case.name == "page" else values(done.metrics),
     {

@@ -102,8 +102,6 @@ def cases(given):
 
 
 EXPERIMENT = Experiment(
-    "paint.rates",
-    "How fast the page of envedit paint is, in a real browser.",
     cases,
     columns={
         "picture": "{pixels}x{pixels}",

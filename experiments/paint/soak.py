@@ -172,8 +172,6 @@ def cases(given):
 
 
 EXPERIMENT = Experiment(
-    "paint.soak",
-    "Random use of the page of envedit paint: memory over time, errors.",
     cases,
     measure,
     {

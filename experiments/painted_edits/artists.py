@@ -126,8 +126,6 @@ def panels(done: Done):
 
 
 EXPERIMENT = Experiment(
-    "painted_edits.artists",
-    "Carry out the twelve edits that lighting artists make, in four scenes under eight maps.",
     cases,
     measure,
     {

@@ -100,8 +100,6 @@ STATISTICS = {
 }
 
 EXPERIMENT = Experiment(
-    "painted_edits",
-    "Carry out the six edits of scenes/edits on the analytic sky and on real maps.",
     cases,
     measure,
     {

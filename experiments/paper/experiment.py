@@ -188,8 +188,6 @@ PAINT = Summary(
 )
 
 EXPERIMENT = Experiment(
-    "paper",
-    "Tables 1 to 3 and Figures 8 and 9 of the paper, under its settings and under ours.",
     cases,
     measure,
     summary=summary,

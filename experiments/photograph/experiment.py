@@ -191,8 +191,6 @@ def panels(done: Done):
 
 
 EXPERIMENT = Experiment(
-    "photograph",
-    "Edit towards photographs of unknown cameras, and the same pictures given linear.",
     cases,
     measure,
     {

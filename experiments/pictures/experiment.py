@@ -143,8 +143,6 @@ def panels(done: Done):
 
 
 EXPERIMENT = Experiment(
-    "pictures",
-    "Edit towards the same light given as a map, as a picture, and as an 8-bit picture of plain Mitsuba.",
     cases,
     measure,
     {

@@ -124,8 +124,6 @@ def cell(text: str) -> str:
 
 
 EXPERIMENT = Experiment(
-    "scenes",
-    "Load, render and edit every Mitsuba scene of a folder, and compare with Mitsuba.",
     cases,
     lambda done: values(done.metrics),
     {

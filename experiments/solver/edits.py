@@ -54,8 +54,6 @@ def cases(given):
 
 
 EXPERIMENT = Experiment(
-    "solver.edits",
-    "Times and errors of nine edits, to compare two versions of the solver; growth with sizes.",
     cases,
     lambda done: values(done.metrics),
     {

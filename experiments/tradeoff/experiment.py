@@ -92,8 +92,6 @@ def means(rows: list[dict]) -> list[dict]:
 
 
 EXPERIMENT = Experiment(
-    "tradeoff",
-    "Measure what speed costs in accuracy: every setting in every cell, one run at a time.",
     cases,
     measure,
     {

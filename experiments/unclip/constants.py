@@ -102,8 +102,6 @@ def _errors(suns, name):
 
 
 EXPERIMENT = Experiment(
-    "unclip.constants",
-    "Measure the constants by which the flux of a clipped sun is estimated, and their errors.",
     cases,
     summary=summary,
     combine=lambda rows: [],  # what there is to show of each map is in the summary

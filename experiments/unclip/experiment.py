@@ -126,8 +126,6 @@ def panels(done):
 
 
 EXPERIMENT = Experiment(
-    "unclip",
-    "Clip maps at four levels and as 8-bit pictures, give their sun back, and compare with the truth.",
     cases,
     lambda done: done.metrics["rows"],
     {

@@ -48,8 +48,6 @@ def measure(done: Done) -> dict:
 
 
 EXPERIMENT = Experiment(
-    "views",
-    "Edit towards a turned map from one view, from another, and from both.",
     cases,
     measure,
     {

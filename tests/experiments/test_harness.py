@@ -30,8 +30,6 @@ def experiment(seeds=(3, 4), version=""):
         return [np.full((2, 3, 3), 0.5), np.ones((4, 4, 3))]
 
     return Experiment(
-        "twice",
-        "Double seeds.",
         lambda given: [Case(f"seed-{s}", {"seed": s}, {"seed": s}, COMMAND, version) for s in seeds],
         lambda done: done.metrics,
         {"seed": "{seed}", "twice": lambda row: number(row["twice"], ".1f")},
@@ -45,7 +43,8 @@ def experiment(seeds=(3, 4), version=""):
 @pytest.fixture
 def run(tmp_path, capsys):
     def call(*words, **made):
-        code = harness.main(experiment(**made), [*words, "--out", str(tmp_path / "out"), "--workers", "1"])
+        words = [*words, "--out", str(tmp_path / "out"), "--workers", "1"]
+        code = harness.main("twice", "Double seeds.", experiment(**made), words)
         return code, capsys.readouterr()
 
     return call
@@ -94,8 +93,6 @@ def test_a_case_may_be_a_function(tmp_path, capsys, monkeypatch):
     monkeypatch.syspath_prepend(Path(__file__).parent)
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))
     made = Experiment(
-        "calls",
-        "Call a function.",
         lambda given: [calling()],
         lambda done: done.metrics["seeds"],
         {"x": {"seed": "{seed}", "n": "{n}"}},
@@ -103,8 +100,9 @@ def test_a_case_may_be_a_function(tmp_path, capsys, monkeypatch):
         failures=lambda rows: [f"n is {row['n']}" for row in rows if row["n"] > 0],
         alone=True,
     )
-    assert harness.main(made, ["run", "--out", str(tmp_path), "--set", "seed=9"]) == 1
-    assert harness.main(made, ["sheet", "--out", str(tmp_path), "--set", "seed=9"]) == 2
+    asked = ["--out", str(tmp_path), "--set", "seed=9"]
+    assert harness.main("calls", "Call a function.", made, ["run", *asked]) == 1
+    assert harness.main("calls", "Call a function.", made, ["sheet", *asked]) == 2
     said = capsys.readouterr()
     assert said.out == "x:\n\n| seed | n |\n| --- | --- |\n| 9 | 0 |\n| 9 | 1 |\n"
     assert said.err.endswith("FAILED: n is 1\ncalls: there is no sheet of calls; give run or table\n")
@@ -116,8 +114,6 @@ def test_a_case_may_be_a_function(tmp_path, capsys, monkeypatch):
 
 def test_rows_may_be_combined(tmp_path):
     made = Experiment(
-        "sums",
-        "Add up.",
         lambda given: [],
         columns={"kind": "{kind}", "sum": "{n}"},
         combine=lambda rows: [{"kind": "both", "n": sum(row["n"] for row in rows)}],

@@ -48,6 +48,7 @@ from envedit.core.color import tonemap
 from envedit.core.errors import ConfigError, EnveditError, InputError
 from envedit.images import images
 from experiments import call
+from experiments.summary import markdown, values
 
 NOTHING = "no case is done by this version of the program; run computes them"
 GAP = 3
@@ -72,7 +73,11 @@ class Case:
 
 
 def calling(
-    name: str, function: Callable[..., dict], tables: dict, about: dict | None = None, **arguments
+    name: str,
+    function: Callable[..., dict | list[dict]],
+    tables: dict,
+    about: dict | None = None,
+    **arguments,
 ) -> Case:
     """Make a case that calls a function in place of ``envedit run``.
 
@@ -104,8 +109,8 @@ class Done:
     folder: Path
 
     @cached_property
-    def metrics(self) -> dict:
-        """Numbers of its result; InputError if the file cannot be read."""
+    def metrics(self) -> Any:
+        """Numbers of its result, a dict or rows of them; InputError if the file cannot be read."""
         path = self.folder / self.case.result
         try:
             return json.loads(path.read_bytes())
@@ -212,20 +217,17 @@ def carry_out(cases, out: Path, given, stream=None) -> list[sweep.Outcome]:
 # ---- tables and sheets -------------------------------------------------------------------------------------
 
 
-def markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Return a table."""
-    return "\n".join(f"| {' | '.join(row)} |" for row in [head, ["---"] * len(head), *rows])
-
-
 def number(value: float | None, form: str = ".1f") -> str:
     """Format a number; a dash for None and NaN."""
     return "-" if value is None or value != value else format(value, form)
 
 
 def rows_of(experiment: Experiment, done: Iterable[Done]) -> list[dict]:
-    """Return what is known of each case, a row or several."""
+    """Return what is known of each case, a row or several; numbers are as of :func:`.values`."""
     found = [(one.case.about, experiment.measure(one)) for one in done]
-    return [about | row for about, rows in found for row in (rows if isinstance(rows, list) else [rows])]
+    return [
+        about | values(row) for about, rows in found for row in (rows if isinstance(rows, list) else [rows])
+    ]
 
 
 def table(experiment: Experiment, rows: list[dict]) -> str:

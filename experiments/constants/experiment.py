@@ -87,16 +87,16 @@ def scaled(value: float, factor: float) -> float:
     return max(1, round(value * factor)) if isinstance(value, int) else value * factor
 
 
-def measured(settings: config.Config, folder: Path, module: str = "") -> dict:
+def measured(settings: config.Config, folder: Path, module: str = "") -> list[dict]:
     """Make the edits with each constant of a module halved and doubled; without a module, as they are."""
     if not module:
-        return {"rows": [{"constant": None, "change": "", "edits": _edits()}]}
+        return [{"constant": "", "change": "", "edits": _edits()}]
     rows = []
     for one in constants():
         for change, factor in FACTORS.items() if one.module == module else ():
             with _changed(one, scaled(one.value, factor)):
                 rows.append({"constant": one.label, "change": change, "edits": _edits()})
-    return {"rows": rows}
+    return rows
 
 
 @contextlib.contextmanager
@@ -151,17 +151,17 @@ def cases(given) -> list[Case]:
 
 def combine(rows: list[dict]) -> list[dict]:
     """Return a row a constant: by how much numbers differ from those of the edits as they are."""
-    base = next(row["edits"] for row in rows if row["constant"] is None)
+    base = next(row["edits"] for row in rows if not row["constant"])
     by_label = {one.label: one for one in constants()}
     combined: dict[str, dict] = {}
     for row in rows:
-        if row["constant"] is None:
+        if not row["constant"]:
             continue
         changes: dict[str, float] = {"rendering": 0.0, "map": 0.0, "paint": 0.0}
         for edit, numbers in row["edits"].items():
             for kind in changes:
-                if numbers.get(kind) is not None and base[edit].get(kind) is not None:
-                    change = numbers[kind] - base[edit][kind]
+                change = numbers.get(kind, math.nan) - base[edit].get(kind, math.nan)
+                if change == change:
                     changes[kind] = max(changes[kind], change, key=abs)
             if "failed" in numbers:
                 changes = dict.fromkeys(changes, math.nan)
@@ -183,7 +183,6 @@ def _changes(change):
 
 EXPERIMENT = Experiment(
     cases=cases,
-    measure=lambda done: done.metrics["rows"],
     combine=combine,
     columns={
         "constant": lambda row: f"`{row['constant'].label}`",

@@ -5,7 +5,7 @@ from collections import Counter
 from pathlib import Path
 
 from experiments.harness import figure
-from experiments.summary import Summary, values
+from experiments.summary import Summary
 
 ADJOINT = 1e-5
 """|<T E, I> - <E, T' I>| over <T E, I>: sums of float32 in two orders, taken in double at the end."""
@@ -19,7 +19,7 @@ PICTURE = 0.05
 def si(value: float | None, unit: str = "") -> str:
     """Write a number with three digits and a prefix: 0.0123 s is 12.3 ms."""
     if not value or not math.isfinite(value):
-        return "-" if value is None else f"{value:g} {unit}".rstrip()
+        return "-" if value is None or value != value else f"{value:g} {unit}".rstrip()
     scales = ((1e9, "G"), (1e6, "M"), (1e3, "k"), (1, ""), (1e-3, "m"), (1e-6, "u"))
     factor, prefix = next((scale for scale in scales if abs(value) >= scale[0]), scales[-1])
     digits = max(0, 2 - len(str(int(abs(value) / factor))) + 1)
@@ -82,7 +82,7 @@ COLUMNS = {
         "forward + backward": median_and_best("step"),
         "its products alone": median_and_best("own"),
         "ratio": "{ratio:.2f}",
-        "PyTorch": lambda r: seconds(r["torch"] and r["torch"]["median_s"]),
+        "PyTorch": lambda r: seconds(r["torch"]["median_s"]),
         "GFLOP/s": "{gflops:.0f}",
         "compiled after warm-up": "{kernels[compiled]} of {kernels[launched]}",
         "growth of memory": lambda r: f"{si(r['memory']['bytes'], 'B')} in {r['memory']['calls']} steps",
@@ -182,10 +182,9 @@ def measure(done) -> list[dict]:
     common = {key: found[key] for key in ("machine", "seconds", "not_finite")}
     choices = {line for rows in found["tables"].values() for row in rows for line in row.get("choices", [])}
     about = {"sampling": "; ".join(sorted(choices)), "load": found["machine"]["load"]}
-    rows = [common | {"table": "machine"} | values(about)]
+    rows = [common | {"table": "machine"} | about]
     for name, some in found["tables"].items():
         shown = SHOWN[done.case.about["section"]] if name == "transport" else (name,)
-        some = [values(row) for row in some] if name == "fits" else some
         rows += [common | {"table": one} | row for one in shown for row in some]
     return rows
 
@@ -196,7 +195,7 @@ def summary(rows: list[dict]) -> str:
     for about in (row["machine"] for row in rows):
         versions = ", ".join(f"{name} {version}" for name, version in about["versions"].items())
         where = f"{about['cpu']}, {about['threads']} threads, {si(about['memory_bytes'], 'B')} of memory"
-        llvm = f"LLVM {(about['llvm'] or {}).get('version')}"
+        llvm = f"LLVM {about['llvm']['version']}"
         machines[f"{where}; {versions}, {llvm}; commit {about['commit']}."] = None
     fits = [row for row in rows if row["table"] == "fits"]
     return "\n\n".join([*machines, *([FITS(fits)] if len(fits) > 1 else [])])
@@ -227,7 +226,7 @@ def _transport(row):
         f"adjoint off by {row['adjointness']:.2g}": row["adjointness"] < ADJOINT,
         "no exact column under a clear sky": row["columns"] > 0,
         "nothing is read": row["read"] > 0 and row["floor_s"] > 0,
-        "T was not found on disk after it was kept there": row["load_s"] is not None,
+        "T was not found on disk after it was kept there": row["load_s"] > 0,  # not of NaN
     }
 
 

@@ -14,7 +14,6 @@ from envedit.core.color import tonemap
 from envedit.images import images
 from experiments import puresky
 from experiments.harness import Case, Done, Experiment, edit_panels, make
-from experiments.summary import values
 
 WIDTH = 256
 LAMPS = {"ceiling": (200, 55), "desk": (165, 8), "corner": (320, 25)}
@@ -103,17 +102,15 @@ def measure(done: Done) -> dict:
     lights = json.loads((done.folder / "lights.json").read_bytes())
     stayed = [one for one in lights["after"] if not one["added"]]
     turn = done.metrics["turn_degrees"]
-    return values(
-        {"initial_envmap": None}  # of a painted target there is none
-        | done.metrics
-        | {
-            "lights": len(lights["before"]),
-            "moved": 0 if turn else sum(one["moved_degrees"] > STAYED for one in stayed),
-            "gone": sum(one["removed"] for one in lights["before"]),
-            "new": sum(one["added"] for one in lights["after"]),
-            "lamps": lamps_found(done.case.about, lights["after"]),
-        }
-    )
+    return {
+        "initial_envmap": None,  # of a painted target there is none
+        **done.metrics,
+        "lights": len(lights["before"]),
+        "moved": 0 if turn else sum(one["moved_degrees"] > STAYED for one in stayed),
+        "gone": sum(one["removed"] for one in lights["before"]),
+        "new": sum(one["added"] for one in lights["after"]),
+        "lamps": lamps_found(done.case.about, lights["after"]),
+    }
 
 
 def panels(done: Done):

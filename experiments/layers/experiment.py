@@ -9,7 +9,7 @@ from envedit.core.color import luminance
 from envedit.losses import metrics
 from experiments import puresky
 from experiments.harness import Case, Done, Experiment
-from experiments.summary import Summary, values
+from experiments.summary import Summary
 
 SUNNY = 1000.0
 """Peak radiance, 256 texels wide, from which on a map is called sunny."""
@@ -52,17 +52,15 @@ def measure(done: Done) -> dict:
     flux = [float((luminance(m[rows]) * omega)[near].sum()) for m in (edited, true)]
     sharp = [metrics.high_frequency_energy(m[rows]) for m in (edited, original, true)]
     sunny = float(luminance(original[rows]).max()) > SUNNY
-    return values(
-        done.metrics
-        | {
-            "sunny": " (sunny)" * sunny,
-            "gain": done.metrics["envmap"]["psnr"] - done.metrics["initial_envmap"]["psnr"],
-            "off": done.metrics["sun_offset_texels"] if sunny else None,
-            "flux": flux[0] / flux[1] if sunny else None,
-            "sharp": sharp[0] / sharp[1],
-            "true_sharp": sharp[2] / sharp[1],
-        }
-    )
+    return {
+        **done.metrics,
+        "sunny": " (sunny)" * sunny,
+        "gain": done.metrics["envmap"]["psnr"] - done.metrics["initial_envmap"]["psnr"],
+        "off": done.metrics["sun_offset_texels"] if sunny else None,
+        "flux": flux[0] / flux[1] if sunny else None,
+        "sharp": sharp[0] / sharp[1],
+        "true_sharp": sharp[2] / sharp[1],
+    }
 
 
 def summary(rows) -> str:

@@ -15,7 +15,7 @@ from envedit.losses import metrics
 from envedit.representations.layers.layers import SCALES, Layers
 from experiments import puresky
 from experiments.harness import Done, Experiment, calling
-from experiments.summary import Summary, values
+from experiments.summary import Summary
 
 WIDTH = 128
 UP = np.array([0.0, 1.0, 0.0])
@@ -68,7 +68,7 @@ def cases(args):
 
 
 def measure(done: Done) -> list[dict]:
-    return [values(done.metrics)] if done.metrics else []
+    return [done.metrics] if done.metrics else []
 
 
 def columns(statistic: str = "") -> dict[str, str]:

@@ -14,7 +14,7 @@ from envedit.representations.layers.separation import separate
 from experiments import puresky
 from experiments.harness import Case, Done, Experiment
 from experiments.light_estimation import protocol
-from experiments.summary import Summary, values
+from experiments.summary import Summary
 
 COUNT = 6
 PUBLISHED = {
@@ -60,7 +60,7 @@ def measure(done: Done) -> list[dict]:
         about = {"kind": kind, "rendering": done.metrics["render"]["psnr"]}
         for sphere, picture in pictures(envmap).items():
             errors = protocol.compared(picture, expected[sphere])
-            rows.append(values(about | {"sphere": sphere} | errors))
+            rows.append(about | {"sphere": sphere} | errors)
         stops = np.abs(protocol.irradiance_error(envmap, true))
         measures = {
             "peak": protocol.peak_error(envmap, true),
@@ -68,7 +68,7 @@ def measure(done: Done) -> list[dict]:
             "stops": float(stops.mean()),
             "worst": float(stops.max()),
         }
-        rows.append(values(about | {"sphere": ""} | measures))
+        rows.append(about | {"sphere": ""} | measures)
     return rows
 
 

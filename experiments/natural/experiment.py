@@ -14,7 +14,7 @@ import numpy as np
 from envedit.images import analytic_sky, images
 from experiments import puresky
 from experiments.harness import Case, Done, Experiment, make
-from experiments.summary import Summary, values
+from experiments.summary import Summary
 
 SCENES = {
     "sphere": "sphere",
@@ -112,18 +112,16 @@ def measure(done: Done) -> dict:
     """Return the numbers of a row. Maps are compared in units of the file: a scene's ``scale`` clips more."""
     original, edited, true = done.maps
     render, ceiling = done.metrics["render"], done.metrics["ceiling"]
-    return values(
-        done.metrics
-        | done.metrics["natural"]
-        | {
-            "over": render["psnr"] - ceiling["psnr"] if ceiling else None,
-            "psnr": psnr(edited, true),
-            "unedited": psnr(original, true),
-            "gain": gained(done, slice(None)),
-            "upper": gained(done, slice(0, WIDTH // 4)),
-            "lower": gained(done, slice(WIDTH // 4, None)),
-        }
-    )
+    return {
+        **done.metrics,
+        **done.metrics["natural"],
+        "over": render["psnr"] - ceiling["psnr"] if ceiling else None,
+        "psnr": psnr(edited, true),
+        "unedited": psnr(original, true),
+        "gain": gained(done, slice(None)),
+        "upper": gained(done, slice(0, WIDTH // 4)),
+        "lower": gained(done, slice(WIDTH // 4, None)),
+    }
 
 
 COLUMNS = {

@@ -51,8 +51,8 @@ def fitted(angle: np.ndarray, covariance: np.ndarray) -> dict:
     return best
 
 
-def differences(settings, folder, files: list[str]) -> dict:
-    """Measure all pairs; returns rows for the axes, and the patches between skies."""
+def differences(settings, folder, files: list[str]) -> list[dict]:
+    """Measure all pairs; returns rows for the axes, each with the patches between skies."""
     logs, directions, omega = fields(files)
     angle = np.arccos(np.clip(directions @ directions.T, -1, 1))
     which = np.digitize(angle, BINS) - 1
@@ -70,7 +70,8 @@ def differences(settings, folder, files: list[str]) -> dict:
     for a, b in pairs:
         first, second = (images.load_envmap(files[k], WIDTH)[0] for k in (a, b))
         between.append(naturalness.patches(first, second))
-    return {"rows": rows, "patches": float(np.sqrt(np.mean(np.square(between))))}
+    patches = float(np.sqrt(np.mean(np.square(between))))
+    return [row | {"patches": patches} for row in rows]
 
 
 def cases(args):
@@ -78,14 +79,9 @@ def cases(args):
     return [calling("skies", differences, {}, files=files)]
 
 
-def measure(done) -> list[dict]:
-    return [{**row, "patches": done.metrics["patches"]} for row in done.metrics["rows"]]
-
-
 EXPERIMENT = Experiment(
     cases,
-    measure,
-    {
+    columns={
         "axis of log radiance": "{axis}",
         "factor of the whole sky": "{whole:.3f}",
         "gradients (degree 1)": "{gradient:.3f}",

@@ -7,7 +7,7 @@ from envedit.core.color import tonemap
 from experiments import puresky
 from experiments.harness import Experiment, calling
 from experiments.paint import figure10
-from experiments.summary import Summary, values
+from experiments.summary import Summary
 
 
 def cases(given):
@@ -29,8 +29,7 @@ def panels(done):
 
 EXPERIMENT = Experiment(
     cases,
-    lambda done: values(done.metrics),
-    {
+    columns={
         "edit": "{edit}",
         "scene": "{scene}",
         "map": "{map}",

@@ -28,7 +28,6 @@ from envedit.images import images
 from envedit.sweep.process import CONFIG
 from experiments import puresky
 from experiments.harness import Done, Experiment, calling
-from experiments.summary import values
 
 MAP = "kloofendal_48d_partly_cloudy"
 CORNER_S, SETTING_S = 0.4, 1.0
@@ -226,7 +225,7 @@ def panels(done: Done):
 
 EXPERIMENT = Experiment(
     cases,
-    lambda done: [] if done.case.name == "page" else values(done.metrics),
+    lambda done: [] if done.case.name == "page" else done.metrics,
     {
         "edit": "{edit}",
         "strokes": lambda row: ", ".join(f"{s['type']} ({shape_of(s) or 'all'})" for s in row["strokes"]),

@@ -9,7 +9,7 @@ import time
 import numpy as np
 
 from envedit.images import analytic_sky, images
-from experiments.harness import Experiment, calling, number
+from experiments.harness import Experiment, calling
 from experiments.paint.figure10 import opened, place, prepared
 
 DRAG_S = 6.0
@@ -108,11 +108,11 @@ EXPERIMENT = Experiment(
         "shown at, pixels": "{shown:.0f}",
         "map, texels": "{texels}",
         "page ready after the command, s": "{ready_s:.1f}",
-        "a light dragged: frames a second": lambda row: number(row["light_frames"], ".3g"),
+        "a light dragged: frames a second": "{light_frames:.3g}",
         "from pointer to picture, ms": "{light_ms:.0f}",
-        "painting: frames a second": lambda row: number(row["stroke_frames"], ".3g"),
+        "painting: frames a second": "{stroke_frames:.3g}",
         "pointer to picture, ms": "{stroke_ms:.0f}",
-        "of them solved": lambda row: number(row["solved_frames"], ".3g"),
+        "of them solved": "{solved_frames:.3g}",
     },
     alone=True,
 )

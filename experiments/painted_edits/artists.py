@@ -17,7 +17,7 @@ from experiments.harness import Case, Done, Experiment, calling
 from experiments.natural.skies import KEPT
 from experiments.painted_edits.experiment import PAINT, STATISTICS, explanation
 from experiments.painted_edits.painters import PAINTERS, SHADOWS, View
-from experiments.summary import Summary, values
+from experiments.summary import Summary
 
 SCENES = ("sphere", "statue", "matpreview", "mesh")
 MAPS = (
@@ -112,7 +112,7 @@ def carry_out(settings, folder, edit: str) -> dict:
 def measure(done: Done) -> list[dict]:
     """Return the row of a case; none where there was nothing to paint on."""
     kept = " (kept out)" if done.case.about["map"] in KEPT else ""
-    return [values({"kept": kept, **done.metrics})] if done.metrics else []
+    return [{"kept": kept, **done.metrics}] if done.metrics else []
 
 
 def panels(done: Done):

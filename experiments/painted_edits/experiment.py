@@ -15,7 +15,7 @@ from envedit.images import images
 from envedit.losses import metrics
 from experiments import puresky
 from experiments.harness import Case, Done, Experiment, overridden
-from experiments.summary import Summary, values
+from experiments.summary import Summary
 
 FOLDER = Path(__file__).parents[2] / "scenes" / "edits"
 EDITS = ("move_shadow", "add_reflection", "add_shadow", "warmer", "enhance_shadow", "blur_shadow")
@@ -57,17 +57,15 @@ def measure(done: Done) -> dict:
     original, edited, _ = done.maps
     rows, painted = done.rows, done.metrics["painted"]
     before = metrics.high_frequency_energy(original[rows])
-    return values(
-        done.metrics
-        | painted
-        | done.metrics["natural"]
-        | {
-            "explanation": explanation(done.metrics.get("choices", [])),
-            "share": painted["towards"] / painted["reachable"] if painted["reachable"] else None,
-            "ssim": metrics.compare(edited[rows], original[rows])["ssim"],
-            "sharp": metrics.high_frequency_energy(edited[rows]) / before if before else None,
-        }
-    )
+    return {
+        **done.metrics,
+        **painted,
+        **done.metrics["natural"],
+        "explanation": explanation(done.metrics.get("choices", [])),
+        "share": painted["towards"] / painted["reachable"] if painted["reachable"] else None,
+        "ssim": metrics.compare(edited[rows], original[rows])["ssim"],
+        "sharp": metrics.high_frequency_energy(edited[rows]) / before if before else None,
+    }
 
 
 def panels(done: Done):

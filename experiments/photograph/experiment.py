@@ -20,7 +20,7 @@ from experiments.light_estimation import protocol
 from experiments.photograph.adam import edited_by_adam
 from experiments.photograph.cameras import CAMERAS, photograph
 from experiments.photograph.insertion import Plate
-from experiments.summary import Summary, values
+from experiments.summary import Summary
 
 SCENES = ("sphere", "statue", "pair")
 FARTHER = 5
@@ -163,7 +163,7 @@ def measure(done: Done) -> list[dict]:
         sun = unedited["sun"] if sun is not None else None
         rows.append({"kind": "unedited", "shown sun": sun, "worse": "", "found": "", **unedited})
         rows.append(rows[0] | {"kind": "all cameras"})
-    return [values(row) for row in rows]
+    return rows
 
 
 SUMMARY = Summary(

@@ -8,15 +8,15 @@ import itertools
 from dataclasses import replace
 
 import mitsuba as mi
-import numpy as np
 
 import envedit
 from envedit import config, inputs
 from envedit.core.color import tonemap
 from envedit.images import images
 from experiments import plain_mitsuba, puresky
-from experiments.harness import Done, Experiment, calling, markdown, number
+from experiments.harness import Done, Experiment, calling
 from experiments.natural.experiment import picked, psnr
+from experiments.summary import Summary
 
 SCENES = ("sphere", "statue", "matpreview")
 TURNS = {
@@ -118,22 +118,31 @@ def write_png(settings, folder, true, file) -> None:
 
 
 def measure(done: Done) -> dict:
-    return done.metrics
+    """Return the numbers of a case, with how much better each way is than the map, and than no edit."""
+    found = dict(done.metrics)
+    for way in WAYS:
+        psnr_of_way = found[way]["psnr"]
+        over, gain = psnr_of_way - found["by_map"]["psnr"], psnr_of_way - found["unedited"]
+        found[way] = found[way] | {"over": over, "gain": gain}
+    return found
 
 
 def summary(rows) -> str:
     """Return means of maps, differences to the target as map, and how many are worse than unedited."""
-    lines = []
-    for way, name in WAYS.items():
-        maps = np.array([row[way]["psnr"] for row in rows])
-        off = maps - [row["by_map"]["psnr"] for row in rows]
-        worse = int((maps < [row["unedited"] for row in rows]).sum())
-        render = np.mean([row[way]["render"] for row in rows])
-        numbers = maps.mean(), off.mean(), off.min(), render
-        lines.append([name, str(len(rows)), *(number(one, ".1f") for one in numbers), str(worse)])
-    numbers = "map, dB", "over the map as target", "least", "rendering, dB"
-    head = "target", "runs", *numbers, "worse than unedited"
-    return markdown(head, lines)
+    return STATISTICS([row[way] | {"target": name} for way, name in WAYS.items() for row in rows])
+
+
+STATISTICS = Summary(
+    {"target": "{target}"},
+    {
+        "runs": "{runs}",
+        "map, dB": "{psnr.mean:.1f}",
+        "over the map as target": "{over.mean:.1f}",
+        "least": "{over.min:.1f}",
+        "rendering, dB": "{render.mean:.1f}",
+        "worse than unedited": "{gain.below[0]}",
+    },
+)
 
 
 def panels(done: Done):
@@ -151,9 +160,9 @@ EXPERIMENT = Experiment(
         "target": "{target}",
         "unedited, dB": "{unedited:.1f}",
         **{f"by {name}, dB": f"{{{way}[psnr]:.1f}}" for way, name in WAYS.items()},
-        "picture over map": lambda m: number(m["by_picture"]["psnr"] - m["by_map"]["psnr"], "+.1f"),
-        "PNG over map": lambda m: number(m["by_png"]["psnr"] - m["by_map"]["psnr"], "+.1f"),
-        "turns, degrees": lambda m: ", ".join(number(m[way]["turn"]) for way in WAYS),
+        "picture over map": "{by_picture[over]:+.1f}",
+        "PNG over map": "{by_png[over]:+.1f}",
+        "turns, degrees": ", ".join(f"{{{way}[turn]:.1f}}" for way in WAYS),
     },
     summary=summary,
     panels=panels,

@@ -15,7 +15,6 @@ from envedit.core.errors import EnveditError, InputError
 from envedit.core.quiet_libraries import quiet_libraries
 from envedit.scene import parser, scene
 from experiments.harness import Experiment, calling
-from experiments.summary import values
 
 WIDTH, MAP = 64, 128
 """Pixels and texels across."""
@@ -125,8 +124,7 @@ def cell(text: str) -> str:
 
 EXPERIMENT = Experiment(
     cases,
-    lambda done: values(done.metrics),
-    {
+    columns={
         "scene": "{scene}",
         "refused": lambda m: cell(m["refused"]),
         "light": "{light}",

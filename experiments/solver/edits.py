@@ -7,7 +7,7 @@ Run two versions in one go, where nothing else runs.
 from envedit import pipeline
 from experiments import puresky
 from experiments.harness import Experiment, calling
-from experiments.summary import Summary, values
+from experiments.summary import Summary
 
 EDITS = (  # map, scene, target (degrees or another map), whether the sky may turn
     ("sunflowers", "sphere", "60", False),
@@ -55,8 +55,7 @@ def cases(given):
 
 EXPERIMENT = Experiment(
     cases,
-    lambda done: values(done.metrics),
-    {
+    columns={
         "edits": {
             "edit": "{edit}",
             "solve, s": "{timing[solve_s]:.2f}",

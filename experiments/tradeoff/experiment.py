@@ -10,7 +10,7 @@ import math
 import statistics
 
 from experiments.harness import Done, Experiment, calling
-from experiments.summary import Numbers, Value, values
+from experiments.summary import Numbers, Value
 
 from . import plan
 from .cell import cell
@@ -76,7 +76,7 @@ def measure(done: Done) -> list[dict]:
     unknown = dict.fromkeys(rows[0])
     bounds = {name: worth(judged) for name, judged in done.metrics["bounds"].items()}
     rows += [unknown | {"setting": f"({name} map)"} | found for name, found in bounds.items()]
-    return [values(row) for row in rows]
+    return rows
 
 
 def means(rows: list[dict]) -> list[dict]:

@@ -9,7 +9,7 @@ from envedit.core.color import luminance, tonemap
 from envedit.images import images
 from envedit.representations.layers import clipped_light, unclip
 from experiments import puresky
-from experiments.harness import Experiment, calling, number
+from experiments.harness import Experiment, calling
 from experiments.summary import Summary
 from experiments.unclip import clipping
 
@@ -23,7 +23,7 @@ def stops(value: float, true: float) -> float:
     return float(np.log2(value / true)) if value > 0 and true > 0 else float("nan")
 
 
-def measure_map(settings, folder, file: str, map_name: str) -> dict:
+def measure_map(settings, folder, file: str, map_name: str) -> list[dict]:
     """Return a row for every clipping of a map, and write the pictures of the sheet."""
     radiance = clipping.load(file)
     true = clipping.truth(radiance, map_name)
@@ -75,7 +75,7 @@ def measure_map(settings, folder, file: str, map_name: str) -> dict:
             for label, one in zip(("clipped", "unclipped"), pictures, strict=True):
                 images.write_exr(folder / f"{label}_{level}.exr", one, panorama=False)
     images.write_exr(folder / "truth.exr", picture, panorama=False)
-    return {"rows": rows}
+    return rows
 
 
 def cases(args):
@@ -127,19 +127,18 @@ def panels(done):
 
 EXPERIMENT = Experiment(
     cases,
-    lambda done: done.metrics["rows"],
-    {
+    columns={
         "map": "{map}",
         "clipped at": "{level}",
         "called": "{kind}",
         "sun added": lambda row: ("false" if row["false"] else "yes") if row["added"] else "",
-        "off, degrees": lambda row: number(row["off"]),
-        "true sun over sky, stops": lambda row: number(row["true_ratio"], "+.1f"),
-        "flux, stops: clipped": lambda row: number(row["clipped_flux"], "+.1f") if row["sunny"] else "",
-        "now": lambda row: number(row["flux"], "+.1f") if row["sunny"] else "",
-        "expected": lambda row: number(row["spread"]) if row["sunny"] else "",
-        "irradiance, stops: clipped": lambda row: number(row["clipped_irradiance"], "+.2f"),
-        "now ": lambda row: number(row["irradiance"], "+.2f"),
+        "off, degrees": "{off:.1f}",
+        "true sun over sky, stops": "{true_ratio:+.1f}",
+        "flux, stops: clipped": lambda row: f"{row['clipped_flux']:+.1f}" if row["sunny"] else "",
+        "now": lambda row: f"{row['flux']:+.1f}" if row["sunny"] else "",
+        "expected": lambda row: f"{row['spread']:.1f}" if row["sunny"] else "",
+        "irradiance, stops: clipped": "{clipped_irradiance:+.2f}",
+        "now ": "{irradiance:+.2f}",
         "shadow: truth, clipped, now": "{true_contrast:.2f} {clipped_contrast:.2f} {contrast:.2f}",
     },
     group=lambda row: f"{row['set']}, {'sunny' if row['sunny'] else 'not sunny'}",

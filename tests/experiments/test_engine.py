@@ -6,6 +6,7 @@ import pytest
 
 import experiments.__main__ as command
 from experiments.engine import tables
+from experiments.summary import values
 from tests.oracles import ROOT
 
 SIREN = {
@@ -31,7 +32,7 @@ def rows(section, table, row):
         {"table": name} for name in tables.NEEDED[section] if name != table and name not in tables.CHECKS
     ]
     common = {"case": "x", "section": section, "quick": False, "not_finite": []}
-    return [common | one for one in [*others, {"table": table} | row]]
+    return [values(common | one) for one in [*others, {"table": table} | row]]
 
 
 def test_there_is_a_table_for_every_marker_of_the_page():

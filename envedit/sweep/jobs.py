@@ -8,7 +8,6 @@ import functools
 import hashlib
 import json
 import os
-import re
 import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,7 +16,7 @@ from pathlib import Path
 import envedit
 from envedit import config
 from envedit.config import presets
-from envedit.core import atomic_files, shipped
+from envedit.core import atomic_files
 from envedit.core.errors import ConfigError, InputError
 from envedit.core.types import FilePath
 from envedit.losses.perceptual import installed
@@ -88,7 +87,7 @@ def job(
 
     # ---- The key
     content = _with_contents(dataclasses.asdict(settings) | {"weights": installed.files(settings)})
-    content["scene"] |= {"file": _scene_digests(scene.file), "parameters": parameters | contents}
+    content["scene"] |= {"file": _scene_digests(scene, base), "parameters": parameters | contents}
     content["program"] = [program(), version]
     key = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:32]
     return Job(name, config.to_toml(settings), key, program(), tuple(command))
@@ -153,30 +152,12 @@ def _with_contents(value):
     return value
 
 
-def _scene_digests(name):
-    """Return the digests of a scene and of all that it names; its path where there is no such file.
+def _scene_digests(scene, base):
+    """Return the digests of a scene and of all that it may read; its name where there is no such file."""
+    from envedit.scene import scene as scenes  # with Mitsuba
 
-    Files that it names and never uses count as well.
-    """
-    folder = shipped.folder()
-    scene = Path(name) if os.path.isabs(name) or folder is None else folder / f"{name}.xml"
-    if not scene.is_file():
-        return name
-    digests: dict[Path, str] = {}
-    pending = [scene]
-    while pending:
-        path = pending.pop()
-        if path in digests:
-            continue
-        digests[path] = _digest(path)
-        if path.suffix.lower() in shipped.USD_ENDINGS:
-            from envedit.scene.usd import conversion  # with Mitsuba
-
-            pending.append(conversion.kept(path).xml)
-        if path.suffix.lower() == ".xml":
-            names = re.findall(r"""(?:value|filename)\s*=\s*["']([^"'$]+)["']""", _text(path))
-            pending += filter(None, (_file_in(path.parent, file_name) for file_name in names))
-    return sorted(digests.values())
+    files = filter(os.path.isfile, scenes.files(scene.file, scene.parameters, base))
+    return sorted({_digest(path) for path in files}) or scene.file
 
 
 def _digest(path):

@@ -12,18 +12,17 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
-import drjit as dr
 import numpy as np
 
 from envedit import config, inputs
-from envedit.core.arrays import tensor
+from envedit.cli import doctor
 from envedit.core.color import tonemap
 from envedit.core.errors import ConfigError
 from envedit.scene.scene import QUIET_DECIBELS, QUIET_LEAST, QUIET_MOST
 
 LATE = 1.3  # times its budget that a run may take; what is expected to take longer is refused
 REFERENCE_RENDER = 1.66e-7  # seconds a pixel and sample of Mitsuba's path tracer, on the reference machine
-REFERENCE_PRODUCT = 0.0134  # seconds of the calibrating products there
+REFERENCE_RATE = 160.0  # GFLOP/s of the calibrating products there
 TEXEL_SECONDS = 4.4e-7  # there, to read, edit and write a texel at the resolution of the file
 PAINTED_FACTOR = 1.6  # times that tracing and search take for a painted picture; two edits: 1.5 to 2.1
 COMPILE_FACTOR = 8.0  # seconds of compiling over those of the first rendering: expected 12 s, taken 13 s
@@ -174,26 +173,10 @@ def calibrate(settings: config.Config, base: Path | None = None) -> Calibration:
     quiet_spp = CALIBRATION_SPP * variance * 10 ** (QUIET_DECIBELS / 10)
     return Calibration(
         render=warm / (scene.width * scene.height * CALIBRATION_SPP),
-        machine=_product_seconds() / REFERENCE_PRODUCT,
+        machine=REFERENCE_RATE / max(doctor.matmul_rate(PRODUCT_SIZE, PRODUCTS) for _ in range(3)),
         compile_s=COMPILE_FACTOR * max(times[0] - 2 * warm, 0.0),
         quiet_spp=int(np.clip(quiet_spp, QUIET_LEAST, QUIET_MOST)),
         aspect=scene.height / scene.width,
         texels=input_map.size[0] * input_map.size[1] if in_file else 0,
         painted=settings.target.kind in ("image", "strokes"),
     )
-
-
-def _product_seconds():
-    """Seconds of a few products of matrices, the fastest of three times, without compiling."""
-    a = tensor(np.full((PRODUCT_SIZE, PRODUCT_SIZE), 1e-3))
-    times = []
-    for _ in range(4):
-        dr.sync_thread()
-        begun = time.perf_counter()
-        x = a
-        for _ in range(PRODUCTS):
-            x = dr.matmul(x, a)
-            dr.eval(x)
-        dr.sync_thread()
-        times.append(time.perf_counter() - begun)
-    return min(times[1:])

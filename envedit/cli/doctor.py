@@ -271,7 +271,7 @@ def _probe(variant: str) -> None:
     start = time.perf_counter()
     radiance = _self_test(mi)
     say(radiance=radiance, render_s=round(time.perf_counter() - start, 3))
-    say(gflops=_matmul_rate(mi, dr))
+    say(gflops=matmul_rate(256, 20))
     say(done=True)
 
 
@@ -305,8 +305,11 @@ def _self_test(mi: ModuleType) -> float:
     return float(np.array(mi.render(scene, integrator=integrator, spp=1024, seed=1)).mean())
 
 
-def _matmul_rate(mi: ModuleType, dr: ModuleType, size: int = 256, repeats: int = 20) -> float:
+def matmul_rate(size: int, repeats: int) -> float:
     """Return the rate of ``size`` x ``size`` matrix products in GFLOP/s, after one to compile."""
+    import drjit as dr
+    import mitsuba as mi
+
     a = dr.full(mi.TensorXf, 1 / size, (size, size))
     product = a @ a
     dr.eval(product)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import functools
 import hashlib
@@ -133,11 +132,8 @@ def _text(path):
 
 def _file_in(folder, value):
     """Return the file in a folder that a value names; None for anything else."""
-    if not isinstance(value, str) or not value or "\0" in value:
-        return None
-    with contextlib.suppress(OSError):  # a text may be too long for a name
-        if (folder / value).is_file():
-            return folder / value
+    if isinstance(value, str) and os.path.isfile(folder / value):  # False for what is no name
+        return folder / value
     return None
 
 

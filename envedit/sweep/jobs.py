@@ -77,7 +77,6 @@ def job(
             contents[key] = _digest(beside_scene)
         elif file := _file_in(base, value):
             parameters[key] = str(file)
-            contents[key] = _digest(file)
     settings = dataclasses.replace(
         installed.settled(settings),
         scene=dataclasses.replace(scene, parameters=parameters),
@@ -86,7 +85,8 @@ def job(
 
     # ---- The key
     content = _with_contents(dataclasses.asdict(settings) | {"weights": installed.files(settings)})
-    content["scene"] |= {"file": _scene_digests(scene, base), "parameters": parameters | contents}
+    content["scene"]["file"] = _scene_digests(scene, base)
+    content["scene"]["parameters"] |= contents
     content["program"] = [program(), version]
     key = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:32]
     return Job(name, config.to_toml(settings), key, program(), tuple(command))

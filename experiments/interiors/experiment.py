@@ -41,8 +41,7 @@ PAINT = [WARM, DARK]
 
 def direction(azimuth: float, elevation: float) -> np.ndarray:
     """Return the unit vector towards a place of the map, degrees."""
-    a, e = math.radians(azimuth), math.radians(elevation)
-    return np.array([math.cos(e) * math.sin(a), math.sin(e), -math.cos(e) * math.cos(a)])
+    return latlong.on_sphere(math.radians(90 - elevation), math.radians(azimuth))
 
 
 def room(lamps: dict[str, tuple[float, float]]) -> np.ndarray:

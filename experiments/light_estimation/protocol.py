@@ -28,6 +28,8 @@ FILM, CROP = (960, 540), 300
 RADIUS = 0.9896
 """Of the sphere: Blender's subdivided mesh is smaller than 1; the area of the ground truth's alpha."""
 SPP, SEED = 16, 900_001
+AXES = np.concatenate([np.eye(3), -np.eye(3)])[[0, 3, 1, 4, 2, 5]]
+"""Normals of the planes: +x, -x, +y, -y, +z, -z."""
 _GRAY = {"type": "rgb", "value": 0.8}
 
 
@@ -172,19 +174,20 @@ def lights_error(estimate: list[dict], true: list[dict], count: int = 5) -> floa
     return float((angles.min(axis=0).mean() + angles.min(axis=1).mean()) / 2)
 
 
+def irradiance(envmap: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """Return the irradiance (n, 3) under a map (H, W, 3) on planes that face unit vectors (n, 3)."""
+    size = envmap.shape[:2]
+    light = np.float64(envmap) * latlong.lookup_solid_angles(*size)[:, None, None]
+    cosines = np.maximum(latlong.directions(*size) @ normals.T, 0)
+    return np.einsum("hwc,hwn->nc", light, cosines)
+
+
 def irradiance_error(estimate: np.ndarray, true: np.ndarray) -> np.ndarray:
     """Return the difference of irradiance on planes that face +x, -x, +y, -y, +z, -z, (6,) stops.
 
     Of luminance; of maps (H, W, 3). 0 where neither map lights a plane, infinite where one does.
     """
-    normals = np.concatenate([np.eye(3), -np.eye(3)])[[0, 3, 1, 4, 2, 5]]
-    both = []
-    for envmap in (estimate, true):
-        height, width, _ = envmap.shape
-        cosines = np.maximum(latlong.directions(height, width) @ normals.T, 0)
-        omega = latlong.lookup_solid_angles(height, width)
-        both.append(np.einsum("hw,h,hwn->n", np.float64(luminance(envmap)), omega, cosines))
-    a, b = both
+    a, b = (luminance(irradiance(envmap, AXES)) for envmap in (estimate, true))
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(a == b, 0.0, np.log2(a / b))
 

@@ -10,12 +10,12 @@ import itertools
 
 import numpy as np
 
-from envedit.core import latlong
 from envedit.core.color import AXES
 from envedit.export.adjustments import balance
 from envedit.images import images
 from envedit.targets.photo import BALANCE_DEVIATION, TINT_DEVIATION
 from experiments import puresky
+from experiments.light_estimation import protocol
 from experiments.photograph.cameras import CAMERAS
 from experiments.photograph.experiment import FARTHER
 
@@ -25,11 +25,7 @@ CAMERA_DEVIATIONS = np.array([BALANCE_DEVIATION, TINT_DEVIATION])
 
 def mean_log_irradiance(envmap: np.ndarray) -> np.ndarray:
     """Return the mean log irradiance (3,) of six planes along the axes, under a map (H, W, 3)."""
-    size = envmap.shape[:2]
-    light = envmap.astype(np.float64) * latlong.lookup_solid_angles(*size)[:, None, None]
-    axes = np.concatenate([np.eye(3), -np.eye(3)])
-    cosines = np.maximum(latlong.directions(*size) @ axes.T, 0)
-    return np.log(np.einsum("hwc,hwk->kc", light, cosines)).mean(axis=0)
+    return np.log(protocol.irradiance(envmap, protocol.AXES)).mean(axis=0)
 
 
 def angle(one: np.ndarray, other: np.ndarray) -> float:

@@ -13,6 +13,7 @@ from envedit.core.color import linear_to_srgb, luminance, srgb_to_linear
 from envedit.images import images
 from envedit.representations.layers.clipped_light import CORE_DEGREES
 from envedit.representations.layers.separation import separate
+from experiments.light_estimation.protocol import irradiance
 
 KEPT = ("evening_road_01", "kloppenheim_06", "rustig_koppie", "syferfontein_18d_clear")
 """Maps that no choice and no constant has seen: every third by name."""
@@ -89,9 +90,7 @@ def truth(radiance: np.ndarray, name: str) -> Truth:
 
 def horizontal(radiance: np.ndarray) -> float:
     """Return the horizontal irradiance of a map, luminance."""
-    height, width, _ = radiance.shape
-    cosine = np.maximum(latlong.directions(height, width)[..., 1], 0)
-    return float((luminance(radiance) * latlong.lookup_solid_angles(height, width)[:, None] * cosine).sum())
+    return float(luminance(irradiance(radiance, np.array([[0.0, 1.0, 0.0]])))[0])
 
 
 class Shadow:

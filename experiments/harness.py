@@ -41,7 +41,6 @@ import OpenEXR
 
 from envedit import config, sweep
 from envedit.cli import sweep as options
-from envedit.config import presets
 from envedit.core import latlong
 from envedit.core.atomic_files import write_atomically
 from envedit.core.color import tonemap
@@ -68,8 +67,8 @@ class Case:
 
     def job(self, overrides: Iterable[str] = ()) -> sweep.Job:
         """Return its job under overrides ``table.key=value``."""
-        how = {"version": self.version, "command": self.command}
-        return sweep.job(self.name, overridden(self.tables, overrides), **how)
+        how = {"version": self.version, "command": self.command, "overrides": overrides}
+        return sweep.job(self.name, self.tables, **how)
 
 
 def calling(
@@ -183,18 +182,6 @@ class Experiment:
     draw: Callable[[list, Path, Path, argparse.Namespace], list[Path]] | None = None
     file: Callable[[argparse.Namespace], str] = lambda given: "table"  # the table's file, without ending
     alone: bool = False  # times are measured: a case at a time, unless the command line says otherwise
-
-
-def overridden(tables: dict, overrides: Iterable[str]) -> dict:
-    """Lay ``table.key=value`` over a configuration's tables."""
-    for text in overrides:
-        keys, value = config.parse_override(text)
-        for key in reversed(keys):
-            value = {key: value}
-        if keys == ("target", "file"):
-            tables = presets.overlaid(tables, {"target": {"rotate_degrees": "auto"}})
-        tables = presets.overlaid(tables, value)
-    return tables
 
 
 # ---- running -----------------------------------------------------------------------------------------------

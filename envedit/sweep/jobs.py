@@ -8,7 +8,7 @@ import hashlib
 import json
 import os
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -48,12 +48,18 @@ def program() -> str:
 
 
 def job(
-    name: str, toml: str | dict, base: FilePath = ".", version: str = "", command: Sequence[str] = ()
+    name: str,
+    toml: str | dict,
+    base: FilePath = ".",
+    version: str = "",
+    command: Sequence[str] = (),
+    overrides: Iterable[str] = (),
 ) -> Job:
     """Make a job of a configuration: TOML text, or its tables; the name is any printable text.
 
-    Relative paths start from the folder ``base``. ``version`` is whatever else decides what comes out, such
-    as the code of ``command``, which carries it out in place of ``envedit run`` and is no part of the key.
+    ``overrides`` are as of :func:`envedit.config.load`. Relative paths start from the folder ``base``.
+    ``version`` is whatever else decides what comes out, such as the code of ``command``, which carries it out
+    in place of ``envedit run`` and is no part of the key.
 
     ConfigError if the configuration is not usable, InputError if a file that it names cannot be read. One
     that does not exist is left to the run to report.
@@ -62,9 +68,9 @@ def job(
         raise ConfigError(f"job {name!r}: got no printable text, expected a name")
     base = Path(base).absolute()
     if isinstance(toml, str):
-        settings = config.loads(toml, base, f"job {name}")
+        settings = config.loads(toml, base, f"job {name}", overrides=overrides)
     else:
-        settings = config.from_dict(toml, base, f"job {name}")
+        settings = config.from_dict(toml, base, f"job {name}", overrides=overrides)
 
     # ---- Files in the scene's parameters: by absolute paths in the job, by their contents in the key
     scene = settings.scene

@@ -14,7 +14,7 @@ from envedit.core.errors import EnveditError
 from envedit.images import images
 from envedit.losses import metrics
 from experiments import puresky
-from experiments.harness import Case, Done, Experiment, overridden
+from experiments.harness import Case, Done, Experiment
 from experiments.summary import Summary
 
 FOLDER = Path(__file__).parents[2] / "scenes" / "edits"
@@ -43,7 +43,7 @@ def cases(args):
     for edit, name in itertools.product(EDITS, maps):
         tables = tomllib.loads((FOLDER / f"{edit}.toml").read_text(encoding="utf-8"))
         tables.pop("output", None)
-        tables = overridden(tables, [f"input.envmap={maps[name]}"])
+        tables["input"] = tables.get("input", {}) | {"envmap": maps[name]}
         made.append(Case(f"{edit}-{name}", tables, {"edit": edit, "map": name}))
     return made
 

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 import experiments.__main__ as command
-from envedit import sweep
+from envedit import config, sweep
 from envedit.core.errors import ConfigError, InputError
 from experiments import harness
 from experiments.constants.experiment import constants
-from experiments.harness import Case, Done, Experiment, markdown, montage, number, overridden
+from experiments.harness import Case, Done, Experiment, markdown, montage, number
 
 STUB = (
     "import json, pathlib, sys, tomllib; folder = pathlib.Path(sys.argv[1]);"
@@ -130,13 +130,13 @@ def test_user_errors_are_one_line(run, tmp_path):
     with pytest.raises(InputError, match="remove its folder and run again"):
         Done(Case("x", {}), tmp_path).metrics  # noqa: B018
     with pytest.raises(ConfigError):
-        overridden({}, ["seed"])
+        Case("x", {}).job(["seed"])
 
 
 def test_an_override_beats_the_case_and_a_target_file_its_turn():
     tables = {"seed": 1, "target": {"rotate_degrees": 60.0, "spp": 8}}
-    found = overridden(tables, ["seed=2", "target.file=b.exr"])
-    assert found == {"seed": 2, "target": {"rotate_degrees": "auto", "spp": 8, "file": "b.exr"}}
+    found = config.loads(Case("x", tables).job(["seed=2", "target.file=/b.exr"]).toml)
+    assert found.seed == 2 and found.target == config.Target(rotate_degrees="auto", spp=8, file="/b.exr")
     assert tables == {"seed": 1, "target": {"rotate_degrees": 60.0, "spp": 8}}
 
 

@@ -103,29 +103,23 @@ class Parameters(Check):
     range = "of strings, numbers and booleans"
 
     def _take(self, value: Any) -> dict[str, str | float | bool]:
-        if not isinstance(value, dict) or any(isinstance(v, dict | list | tuple) for v in value.values()):
+        if not isinstance(value, dict):
             raise WantedError(str(self))
-        return plain(value)
+        return {String()(name): self._scalar(scalar) for name, scalar in value.items()}
+
+    def _scalar(self, value: Any) -> str | float | bool:
+        if isinstance(value, bool):
+            return value
+        if isinstance(value, str):
+            return String()(value)
+        if isinstance(value, Integral):
+            return Integer(-(2**63), 2**63 - 1)(value)
+        if isinstance(value, Real):
+            return Number(-math.inf)(value)
+        raise WantedError(str(self))
 
     def __str__(self) -> str:
         return f"a table {self.range}"
 
     def _schema(self) -> Schema:
         return {"type": "object", "additionalProperties": {"type": ["string", "number", "boolean"]}}
-
-
-def plain(value: Any, depth: int = 8) -> Any:
-    """Accept what :func:`.toml.quote` can write: strings, numbers, booleans, lists and tables of them."""
-    if isinstance(value, bool):
-        return value
-    if isinstance(value, str):
-        return String()(value)
-    if isinstance(value, Integral):
-        return Integer(-(2**63), 2**63 - 1)(value)
-    if isinstance(value, Real):
-        return Number(-math.inf)(value)
-    if depth and isinstance(value, list | tuple):
-        return [plain(v, depth - 1) for v in value]
-    if depth and isinstance(value, dict):
-        return {String()(k): plain(v, depth - 1) for k, v in value.items()}
-    raise WantedError("strings, finite numbers, true or false, and not too deep lists and tables of them")

@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 
 from envedit import config as cfg
-from envedit.config.key_validators import plain as nested_value
-from envedit.config.validators import WantedError
 from envedit.core.errors import ConfigError
 from tests.oracles.builders import refused
 
@@ -61,11 +59,3 @@ def test_numbers_are_normalised():
     assert type(config.fit.lr) is float and type(config.fit.epochs) is int
     assert config.loss.ssim == (1.0, 2.0)
     assert type(cfg.loads("[fit]\nlr = 1").fit.lr) is float
-
-
-def test_too_deep_a_value_is_refused():
-    deep = []
-    for _ in range(20):
-        deep = [deep]
-    with pytest.raises(WantedError, match="not too deep"):
-        nested_value(deep)

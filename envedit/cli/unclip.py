@@ -9,6 +9,9 @@ import numpy as np
 from envedit.cli import doctor, map_command
 from envedit.core.errors import ConfigError
 
+FACTS = ("kind", "reason", "azimuth", "elevation", "radius", "level")
+"""Of what is clipped, for ``--json``."""
+
 
 def main(argv: list[str] | None = None) -> int:
     """Write the map with its sun, if one was clipped; returns the exit code."""
@@ -56,14 +59,7 @@ def _unclip(arguments, console):
 
     # ---- What is clipped, and what flux it gets
     place = f"azimuth {light.azimuth:.1f}, elevation {light.elevation:.1f} degrees"
-    console.facts["light"] = {
-        "kind": light.kind,
-        "reason": light.reason,
-        "azimuth": light.azimuth,
-        "elevation": light.elevation,
-        "radius": light.radius,
-        "level": light.level,
-    }
+    console.facts["light"] = {name: getattr(light, name) for name in FACTS}
     console.say(f"clipped at {light.level:.4g}, {place}: {light.kind}, as {light.reason}")
     flux, stops = _flux(arguments, light)
     forced = stops == 0

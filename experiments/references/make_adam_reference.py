@@ -34,6 +34,18 @@ def gradients(rng, scale):
     }
 
 
+def rates(lr, steps, schedule, **options):
+    """List the learning rates of some steps under a schedule."""
+    sgd = torch.optim.SGD([torch.zeros(1, requires_grad=True)], lr=lr)
+    scheduler = schedule(sgd, **options)
+    found = []
+    for _ in range(steps):
+        found.append(sgd.param_groups[0]["lr"])
+        sgd.step()
+        scheduler.step()
+    return np.array(found)
+
+
 def main(path):
     rng = np.random.default_rng(20240917)
     record = {"kept": np.array(KEPT), "lr": np.float64(1e-2)}
@@ -55,24 +67,9 @@ def main(path):
             record[f"{label}/grad/{name}"] = grads[name]
             record[f"{label}/trace/{name}"] = np.stack(trace[name])
 
-    leaf = torch.zeros(1, requires_grad=True)
-    sgd = torch.optim.SGD([leaf], lr=5e-5)
-    restarts = torch.optim.lr_scheduler.CosineAnnealingWarmRestarts(sgd, T_0=100)
-    rates = []
-    for _ in range(350):
-        rates.append(sgd.param_groups[0]["lr"])
-        sgd.step()
-        restarts.step()
-    record["warm_restarts"] = np.array(rates)
-
-    sgd = torch.optim.SGD([leaf], lr=2e-3)
-    cosine = torch.optim.lr_scheduler.CosineAnnealingLR(sgd, T_max=60, eta_min=1e-5)
-    rates = []
-    for _ in range(61):
-        rates.append(sgd.param_groups[0]["lr"])
-        sgd.step()
-        cosine.step()
-    record["cosine"] = np.array(rates)
+    schedules = torch.optim.lr_scheduler
+    record["warm_restarts"] = rates(5e-5, 350, schedules.CosineAnnealingWarmRestarts, T_0=100)
+    record["cosine"] = rates(2e-3, 61, schedules.CosineAnnealingLR, T_max=60, eta_min=1e-5)
     np.savez_compressed(path, **record)
     print(f"torch {torch.__version__}: {path}")
 

@@ -76,6 +76,7 @@ class ViewList(Check):
 
     kind = "string or list"
     range = '"all", or ids and indices from 0'
+    words = '"all", or a list of ids of sensors or of indices from 0, each once'
 
     def _take(self, value: Any) -> str | tuple[int | str, ...]:
         if isinstance(value, str) and value == "all":
@@ -86,9 +87,6 @@ class ViewList(Check):
         except (TypeError, WantedError):
             pass
         raise WantedError(str(self))
-
-    def __str__(self) -> str:
-        return '"all", or a list of ids of sensors or of indices from 0, each once'
 
     def _schema(self) -> Schema:
         views: Schema = {"type": "array", "items": View().schema(), "minItems": 1, "uniqueItems": True}
@@ -101,6 +99,7 @@ class Parameters(Check):
 
     kind = "table"
     range = "of strings, numbers and booleans"
+    words = f"a table {range}"
 
     def _take(self, value: Any) -> dict[str, str | float | bool]:
         if not isinstance(value, dict):
@@ -117,9 +116,6 @@ class Parameters(Check):
         if isinstance(value, Real):
             return Number(-math.inf)(value)
         raise WantedError(str(self))
-
-    def __str__(self) -> str:
-        return f"a table {self.range}"
 
     def _schema(self) -> Schema:
         return {"type": "object", "additionalProperties": {"type": ["string", "number", "boolean"]}}

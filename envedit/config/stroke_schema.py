@@ -42,6 +42,7 @@ class Color(Check):
 
     kind = "list or string"
     range = '3 numbers, 0 to 1e+06; or "#rrggbb"'
+    words = '[r, g, b], or a colour such as "#ffd9a6"'
 
     def _take(self, value: Any) -> list[float]:
         if isinstance(value, str):
@@ -50,9 +51,6 @@ class Color(Check):
             codes = np.frombuffer(bytes.fromhex(value[1:]), np.uint8)
             return [float(round(c, 4)) for c in srgb_to_linear(codes / 255)]
         return _LINEAR(value)
-
-    def __str__(self) -> str:
-        return '[r, g, b], or a colour such as "#ffd9a6"'
 
     def _schema(self) -> Schema:
         return {"anyOf": [_LINEAR.schema(), {"type": "string", "pattern": "^#[0-9a-fA-F]{6}$"}]}
@@ -64,14 +62,12 @@ class Ellipse(Check):
 
     kind = "list"
     range = "[cx, cy, rx, ry] or [cx, cy, rx, ry, degrees]"
+    words = range
 
     def _take(self, value: Any) -> list[float]:
         if not isinstance(value, list | tuple) or len(value) not in (4, 5):
             raise WantedError(str(self))
         return Numbers(*_ELLIPSE[: len(value)])(value)
-
-    def __str__(self) -> str:
-        return self.range
 
     def _schema(self) -> Schema:
         return Numbers(*_ELLIPSE).schema() | {"minItems": 4}
@@ -83,6 +79,7 @@ class Rectangle(Check):
 
     kind = "list"
     range = "[x0, y0, x1, y1]"
+    words = "[x0, y0, x1, y1] with x1 above x0 and y1 above y0"
 
     def _take(self, value: Any) -> list[float]:
         if not isinstance(value, list | tuple) or len(value) != 4:
@@ -91,9 +88,6 @@ class Rectangle(Check):
         if x1 <= x0 or y1 <= y0:
             raise WantedError(str(self))
         return [x0, y0, x1, y1]
-
-    def __str__(self) -> str:
-        return "[x0, y0, x1, y1] with x1 above x0 and y1 above y0"
 
     def _schema(self) -> Schema:
         return _CORNERS.schema()

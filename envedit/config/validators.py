@@ -36,6 +36,8 @@ class WantedError(Exception):
 class Check(ABC):
     """What a key may be."""
 
+    words: str = ""  # what is accepted, as the end of a sentence, where no number is in it
+
     @property
     def kind(self) -> str:
         """Its type in a word or two."""
@@ -54,9 +56,9 @@ class Check(ABC):
         """Return what is accepted as JSON Schema; where that cannot say all, it accepts more."""
         return self._schema()
 
-    @abstractmethod
     def __str__(self) -> str:
         """Say what is accepted, as the end of a sentence."""
+        return self.words
 
     @abstractmethod
     def _take(self, value: Any) -> Any: ...
@@ -73,6 +75,7 @@ class Tables(Check):
     """
 
     kind = "list of tables"
+    words = "a list of tables"
     name: str  # of the key, "input.lights"
     most: int | None = None  # entries; None: any number
 
@@ -85,9 +88,6 @@ class Tables(Check):
 
     @abstractmethod
     def _entry(self, name: str, table: dict[str, Any]) -> dict[str, Any]: ...
-
-    def __str__(self) -> str:
-        return "a list of tables"
 
     @property
     def range(self) -> str:
@@ -109,6 +109,7 @@ class String(Check):
 
     least: int = 0
     kind = "string"
+    words = "a string"
 
     def _take(self, value: Any) -> str:
         if isinstance(value, PathLike):
@@ -120,9 +121,6 @@ class String(Check):
             raise WantedError("a string of valid characters, without NUL")
         return str(value)
 
-    def __str__(self) -> str:
-        return "a string"
-
     def _schema(self) -> Schema:
         return {"type": "string"} | ({"minLength": self.least} if self.least else {})
 
@@ -132,14 +130,12 @@ class Boolean(Check):
     """True or false."""
 
     kind = "boolean"
+    words = "true or false"
 
     def _take(self, value: Any) -> bool:
         if not isinstance(value, bool):
             raise WantedError(str(self))
         return value
-
-    def __str__(self) -> str:
-        return "true or false"
 
     def _schema(self) -> Schema:
         return {"type": "boolean"}
@@ -298,16 +294,12 @@ class Either(Check):
     """What one of several checks accepts, in words of its own."""
 
     checks: tuple[Check, ...]
-    words: str
 
     def _take(self, value: Any) -> Any:
         for check in self.checks:
             with contextlib.suppress(WantedError):
                 return check(value)
         raise WantedError(self.words)
-
-    def __str__(self) -> str:
-        return self.words
 
     def _schema(self) -> Schema:
         return {"anyOf": [check.schema() for check in self.checks]}

@@ -44,13 +44,10 @@ class Places(Check):
         except WantedError:
             raise WantedError(f"{self}; azimuth from -360 to 720, elevation from -90 to 90 degrees") from None
 
-    def __str__(self) -> str:
-        return f"[[azimuth, elevation], ...], {self.least} to {MOST_POINTS}"
-
     @property
     def range(self) -> str:
         """Their form and number."""
-        return str(self)
+        return f"[[azimuth, elevation], ...], {self.least} to {MOST_POINTS}"
 
     def _schema(self) -> Schema:
         items = _POINT.schema()

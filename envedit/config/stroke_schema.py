@@ -62,7 +62,6 @@ class Ellipse(Check):
 
     kind = "list"
     range = "[cx, cy, rx, ry] or [cx, cy, rx, ry, degrees]"
-    words = range
 
     def _take(self, value: Any) -> list[float]:
         if not isinstance(value, list | tuple) or len(value) not in (4, 5):
@@ -105,13 +104,10 @@ class Points(Check):
             raise WantedError(str(self))
         return [_POINT(v) for v in value]
 
-    def __str__(self) -> str:
-        return f"[[x, y], ...], at least {self.least}"
-
     @property
     def range(self) -> str:
         """Their form and number."""
-        return str(self)
+        return f"[[x, y], ...], at least {self.least}"
 
     def _schema(self) -> Schema:
         return {"type": "array", "items": _POINT.schema(), "minItems": self.least}

@@ -36,7 +36,7 @@ class WantedError(Exception):
 class Check(ABC):
     """What a key may be."""
 
-    words: str = ""  # what is accepted, as the end of a sentence, where no number is in it
+    words: str = ""  # what is accepted, as the end of a sentence; "": as :attr:`range`
 
     @property
     def kind(self) -> str:
@@ -58,7 +58,7 @@ class Check(ABC):
 
     def __str__(self) -> str:
         """Say what is accepted, as the end of a sentence."""
-        return self.words
+        return self.words or self.range
 
     @abstractmethod
     def _take(self, value: Any) -> Any: ...

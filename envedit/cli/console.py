@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from envedit.core.errors import EnveditError, unwrapped
 
 if TYPE_CHECKING:
-    from envedit.cli.progress import JsonProgress, Progress
+    from envedit.cli.progress import Progress
 
 
 def make_parser(
@@ -68,7 +68,7 @@ class Console:
         else:
             print(line, file=sys.stderr)
 
-    def progress(self) -> Progress | JsonProgress:
+    def progress(self) -> Progress:
         """Return what shows progress."""
         from envedit.cli.progress import JsonProgress, Progress
 

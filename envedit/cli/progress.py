@@ -74,22 +74,12 @@ class Progress:
             self._bar = None
 
 
-class JsonProgress:
-    """Report stages and progress as JSON lines on stderr; used like :class:`Progress`.
+class JsonProgress(Progress):
+    """Report stages and progress as JSON lines on stderr.
 
     A stage begins with ``{"event": "stage", "stage": text}``; then, at most every :data:`JSON_SECONDS` and
     when it is done, come ``{"event": "progress", "stage":, "done":, "total":, "text":}``.
     """
-
-    def __init__(self) -> None:
-        self._stage = ""
-        self._last_line = 0.0
-
-    def __enter__(self) -> JsonProgress:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        pass
 
     def tell(self, event: str, **facts: object) -> None:
         """Write one line."""

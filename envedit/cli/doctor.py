@@ -14,7 +14,6 @@ LLVM library changes, so that later runs pay a millisecond.
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import glob
 import hashlib
@@ -32,6 +31,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from envedit.cli.console import make_parser
 from envedit.cli.streams import steady
 from envedit.core.atomic_files import opened, write_atomically
 from envedit.core.errors import InputError, MachineError
@@ -328,11 +328,8 @@ def matmul_rate(size: int, repeats: int) -> float:
 @steady
 def main(arguments: list[str] | None = None) -> int:
     """Print the versions and the outcome of the self test; return the exit code, 0 or 4."""
-    parser = argparse.ArgumentParser(
-        prog="envedit doctor",
-        description="Check whether this machine can run envedit: exit code 0, or 4 and what to do.",
-        epilog="example: envedit doctor --variant cuda_ad_rgb",
-    )
+    about = "Check whether this machine can run envedit: exit code 0, or 4 and what to do."
+    parser = make_parser("doctor", about, ["envedit doctor --variant cuda_ad_rgb"])
     parser.add_argument(
         "--variant",
         default="llvm_ad_rgb",

@@ -9,7 +9,6 @@ import mitsuba as mi
 from envedit import config, inputs
 from envedit.cli import doctor
 from envedit.cli.console import Console, exit_code, make_parser
-from envedit.cli.progress import Progress
 from envedit.cli.streams import steady
 from envedit.config import presets
 from envedit.images import images
@@ -73,7 +72,7 @@ def _fit(arguments, settings, original, folder, console):
     network = settings.representation
 
     # ---- Fit
-    with Progress() as progress:
+    with console.progress() as progress:
         progress.stage(f"fitting {arguments.map}")
         fitted = fit.fit(
             active,

@@ -98,6 +98,16 @@ def place(page, selector, x, y):
     return box["x"] + x * box["width"], box["y"] + y * box["height"]
 
 
+def drag(page, places, pause, steps=1):
+    """Drag the pointer from the first over the other places of the page, with a pause at each, seconds."""
+    page.mouse.move(*places[0])
+    page.mouse.down()
+    for spot in places[1:]:
+        page.mouse.move(*spot, steps=steps)
+        time.sleep(pause)
+    page.mouse.up()
+
+
 def choose(page, name):
     """Press a button."""
     page.get_by_test_id(name).click()
@@ -154,12 +164,7 @@ def paint(page, stroke):
         corners = [stroke["rectangle"][:2], stroke["rectangle"][2:]]
     else:
         corners = stroke.get("points", [(0, 0), (1, 1)])
-    page.mouse.move(*at(corners[0]))
-    page.mouse.down()
-    for corner in corners[1:]:
-        page.mouse.move(*at(corner), steps=8)
-        time.sleep(CORNER_S)
-    page.mouse.up()
+    drag(page, [at(corner) for corner in corners], CORNER_S, steps=8)
 
 
 def edit(settings, folder, strokes) -> dict:

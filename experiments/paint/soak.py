@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from experiments.harness import Experiment, calling, done_of, figure
-from experiments.paint.figure10 import RENDERED, opened, place, prepared
+from experiments.paint.figure10 import RENDERED, drag, opened, place, prepared
 
 MEMORY_EVERY_S = 1.0
 ACTIONS = (
@@ -18,6 +18,7 @@ ACTIONS = (
 )
 BUTTONS = ("add-light", "light-mute", "light-delete", "region-remove", "clear", "shape-polygon")
 KEYS = ("b", "1", "5", "[", "]", "Escape", "Enter", "Control+z", "ArrowLeft")
+MOVE_S = 0.03
 LONGEST_PAUSE_S = 2.0
 """Between two actions, so that some of them are solved for and others are superseded."""
 SEEN_HANDLES = """() => {
@@ -46,17 +47,18 @@ def act(page, chance: random.Random) -> str:
             buttons = page.locator(name)
             if buttons.count():
                 buttons.nth(chance.randrange(buttons.count())).click()
-        drag(page, [spot("#overlay") for _ in range(chance.randrange(2, 12))])
+        drag(page, [spot("#overlay") for _ in range(chance.randrange(2, 12))], MOVE_S)
     elif what == "light":
         seen = page.evaluate(SEEN_HANDLES)  # the map may be zoomed
         if seen:
-            drag(page, [chance.choice(seen), *(spot("#map-stack") for _ in range(chance.randrange(1, 12)))])
+            spots = [spot("#map-stack") for _ in range(chance.randrange(1, 12))]
+            drag(page, [chance.choice(seen), *spots], MOVE_S)
     elif what == "region":
         page.get_by_test_id("region").click()
         kind = page.get_by_test_id("region-action")
         if kind.is_visible():
             kind.select_option(chance.choice(["keep", "scale", "fill"]))
-            drag(page, [spot("#map-stack") for _ in range(chance.randrange(2, 6))])
+            drag(page, [spot("#map-stack") for _ in range(chance.randrange(2, 6))], MOVE_S)
     elif what in ("undo", "redo"):
         page.get_by_test_id(what).click(force=True)
     elif what == "button":
@@ -77,16 +79,6 @@ def act(page, chance: random.Random) -> str:
         page.wait_for_selector(".handle", state="attached", timeout=120_000)
     time.sleep(LONGEST_PAUSE_S * chance.random())
     return what
-
-
-def drag(page, places):
-    """Drag the pointer over places."""
-    page.mouse.move(*places[0])
-    page.mouse.down()
-    for spot in places:
-        page.mouse.move(*spot)
-        time.sleep(0.03)
-    page.mouse.up()
 
 
 def at_rest_mb(page, process) -> float:

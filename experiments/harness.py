@@ -166,7 +166,8 @@ class Experiment:
     cases: Callable[[argparse.Namespace], list[Case]]  # of the parsed command line
     # A row of numbers, or several; with the case's ``about``, the columns are made of them
     measure: Callable[[Done], dict | list[dict]] = lambda done: done.metrics
-    # Heading -> format string, or callable of the row that returns the text; or this of each group
+    # Heading -> format string, or callable of the row that returns the text; or this of each group. Without
+    # columns the summary is all
     columns: dict[str, Any] = field(default_factory=dict)
     # Row -> heading of the part of the table that it belongs to; "" for one table
     group: Callable[[dict], str] = lambda row: ""
@@ -222,7 +223,7 @@ def table(experiment: Experiment, rows: list[dict]) -> str:
     if not rows:
         return NOTHING
     parts = [experiment.summary(rows)] if experiment.summary else []
-    rows = experiment.combine(rows)
+    rows = experiment.combine(rows) if experiment.columns else []
     for heading in dict.fromkeys(map(experiment.group, rows)):
         some = [row for row in rows if experiment.group(row) == heading]
         columns = experiment.columns.get(heading, experiment.columns)

@@ -55,6 +55,5 @@ EXPERIMENT = Experiment(
         | {"most memory beyond the declared image": "{mib.max:.1f} MiB"},
     ),
     failures=failures,
-    combine=lambda rows: [],  # the pieces of each kind are added up
     options=options,
 )

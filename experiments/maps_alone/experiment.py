@@ -110,7 +110,6 @@ EXPERIMENT = Experiment(
             "peak memory, MB": "{megabytes.max:.0f}",
         },
     ),
-    combine=lambda rows: [],  # the largest numbers of each command alone
     failures=failures,
     alone=True,
 )

@@ -191,7 +191,6 @@ EXPERIMENT = Experiment(
     cases,
     measure,
     summary=summary,
-    combine=lambda rows: [],  # means alone
     sheet=lambda case: "{table}-{settings}-{roughness}".format(**case.about).removesuffix("-None"),
     options=options,
     file=lambda args: args.name,

@@ -205,11 +205,6 @@ def carry_out(cases, out: Path, given, stream=None) -> list[sweep.Outcome]:
 # ---- tables and sheets -------------------------------------------------------------------------------------
 
 
-def number(value: float | None, form: str = ".1f") -> str:
-    """Format a number; a dash for None and NaN."""
-    return "-" if value is None or value != value else format(value, form)
-
-
 def rows_of(experiment: Experiment, done: Iterable[Done]) -> list[dict]:
     """Return what is known of each case, a row or several; numbers are as of :func:`.values`."""
     found = [(one.case.about, experiment.measure(one)) for one in done]

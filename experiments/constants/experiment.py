@@ -19,7 +19,8 @@ from pathlib import Path
 import envedit
 from envedit import config, pipeline
 from envedit.config import presets
-from experiments.harness import Case, Experiment, calling, number
+from experiments.harness import Case, Experiment, calling
+from experiments.summary import values
 
 FACTORS = {"halved": 0.5, "doubled": 2.0}
 NO_SCALE = {"light_places.PLACES_APART_COSINE", "prior.DEGREES", "normal_equations.ROWS"}
@@ -176,7 +177,7 @@ def _changes(change):
         found = row.get(change)
         if found is None:
             return "-"
-        return ", ".join(number(found[kind], "+.1f") for kind in ("rendering", "map", "paint"))
+        return "{rendering:+.1f}, {map:+.1f}, {paint:+.1f}".format_map(values(found))
 
     return text
 

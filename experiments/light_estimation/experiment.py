@@ -53,7 +53,7 @@ def measure(done: Done) -> list[dict]:
     """Return rows of the edited and of the unedited map: one for each sphere, and one of the map itself."""
     original, edited, true = done.maps
     lights = json.loads((done.folder / "lights.json").read_bytes())
-    true_lights = light_list.listed(separate(true), np.eye(3))
+    true_lights = light_list.listed(separate(true).lights, true.shape[:2], np.eye(3))
     expected = pictures(true)
     rows = []
     for kind, envmap, when in (("edited", edited, "after"), ("unedited", original, "before")):

@@ -151,12 +151,9 @@ class _DistsTo:
         self._stack = dists.backbone.stack(self.shape[0], self.shape[1], "hanning")
         self._weights = dists.weights
         self._reference = []
-        for y, pixels, channels in self._features(dr.detach(reference.array))[0]:
-            zero = dr.zeros(mi.Float64, channels)
-            mean = _sums(y, y, zero, zero, pixels, channels)[0] / pixels
-            variance = _sums(y, y, mean, zero, pixels, channels)[2] / pixels
-            dr.eval(mean, variance)
-            self._reference.append((y, mean, variance))
+        for y, channels in self._features(dr.detach(reference.array))[0]:
+            mean = _means(y, channels)
+            self._reference.append((y, mean, _variances(y, mean)))
 
     def __call__(self, x: Tensor) -> DrArray:
         if tuple(x.shape) != self.shape:
@@ -168,30 +165,32 @@ class _DistsTo:
     def _features(self, x):
         tape = self._stack.forward(_normalised(x))
         dr.eval(x)
-        return [(x, self.shape[0] * self.shape[1], 3), *self._stack.taps(tape)], tape
+        return [(x, 3), *((tap, channels) for tap, _, channels in self._stack.taps(tape))], tape
 
     def _evaluate(self, x, with_gradient):
         features, tape = self._features(x)
         score = 0
         gradients = []
-        for (value, pixels, channels), (y, mean_y, variance_y), (alpha, beta) in zip(
+        for (value, channels), (y, mean_y, variance_y), (alpha, beta) in zip(
             features, self._reference, self._weights, strict=True
         ):
-            zero = dr.zeros(mi.Float64, channels)
-            mean_x, mean_d = (s / pixels for s in _sums(value, y, zero, zero, pixels, channels)[:2])
-            dr.eval(mean_x, mean_d)
-            sums = _sums(value, y, mean_x, mean_d, pixels, channels)
+            d = mi.Float64(value) - y
+            mean_x, mean_d = _means(value, channels), _means(d, channels)
             scale_1 = 1 / (dr.square(mean_x) + dr.square(mean_y) + C1)
-            scale_2 = 1 / (sums[2] / pixels + variance_y + C2)
-            texture, structure = dr.square(mean_d) * scale_1, sums[3] / pixels * scale_2
+            scale_2 = 1 / (_variances(value, mean_x) + variance_y + C2)
+            texture = dr.square(mean_d) * scale_1
+            structure = _variances(d, mean_d) * scale_2
             score += dr.sum(alpha * texture + beta * structure)
             if with_gradient:
-                slopes = (
-                    2 / pixels * alpha * scale_1 * (mean_d - texture * mean_x),  # of the mean
-                    2 / pixels * beta * scale_2,  # of d - its mean
-                    -2 / pixels * beta * scale_2 * structure,  # of x - its mean
-                )
-                gradients.append(_channelwise(value, y, mean_x, mean_d, slopes, channels))
+                pixels = len(value) // channels
+                # Of the mean, of d - its mean, and of x - its mean: affine in x and d for each channel.
+                slope = 2 / pixels * alpha * scale_1 * (mean_d - texture * mean_x)
+                slope_d = 2 / pixels * beta * scale_2
+                slope_x = -slope_d * structure
+                columns = [type(x)(c) for c in (slope - slope_d * mean_d - slope_x * mean_x, slope_d, slope_x)]
+                dr.eval(columns)
+                slope, slope_d, slope_x = (_along(column, len(value)) for column in columns)
+                gradients.append(slope + slope_d * (value - y) + slope_x * value)
         score = type(x)(score)
         if not with_gradient:
             return score, None
@@ -201,56 +200,24 @@ class _DistsTo:
         return score, gradient
 
 
-def _channelwise(x, y, mean_x, mean_d, slopes, channels):
-    """Gradient of the share that a feature map has in DISTS: affine in x and d = x - y for each channel."""
-    F = type(x)
-    _, channel = Divisor(channels).split(dr.arange(mi.Int32, len(x)))
-    columns = [F(values) for values in (mean_x, mean_d, *slopes)]
-    dr.eval(columns)
-    mean_x, mean_d, a, b, c = (dr.gather(F, values, mi.UInt32(channel)) for values in columns)
-    return a + b * (x - y - mean_d) + c * (x - mean_x)
+def _means(values, channels):
+    """Return the mean of each channel over the pixels of a feature map, in double precision."""
+    pixels = len(values) // channels
+    rows = mi.TensorXd(mi.Float64(values), (pixels, channels))
+    mean = dr.matmul(dr.full(mi.TensorXd, 1 / pixels, (1, pixels)), rows).array
+    dr.eval(mean)
+    return mean
 
 
-_STRETCHES = 32
+def _variances(values, mean):
+    """Return the mean square of each channel's difference from its mean."""
+    return _means(dr.square(values - _along(mean, len(values))), len(mean))
 
 
-def _sums(x, y, mean_x, mean_d, pixels, channels):
-    """Sum x - mean_x, d - mean_d and their squares over the pixels of a channel; d = x - y, in double."""
-    parts = _sums_of_stretches(
-        x,
-        y,
-        mean_x,
-        mean_d,
-        dr.arange(mi.UInt32, channels * _STRETCHES),
-        dr.opaque(mi.UInt32, channels),
-        dr.opaque(mi.UInt32, pixels),
-        dr.opaque(mi.UInt32, -(-pixels // _STRETCHES)),
-    )
-    dr.eval(parts)
-    lane, step = dr.arange(mi.UInt32, channels), dr.opaque(mi.UInt32, channels)
-    sums = [sum(dr.gather(mi.Float64, part, lane + i * step) for i in range(_STRETCHES)) for part in parts]
-    dr.eval(sums)
-    return sums
-
-
-@dr.syntax
-def _sums_of_stretches(x, y, mean_x, mean_d, lane, channels, pixels, rows):
-    stretch = lane // channels
-    channel = lane - stretch * channels
-    mx, md = dr.gather(mi.Float64, mean_x, channel), dr.gather(mi.Float64, mean_d, channel)
-    i = stretch * rows * channels + channel
-    stop = dr.minimum((stretch + 1) * rows, pixels) * channels
-    sum_x, sum_d, square_x, square_d = mi.Float64(0), mi.Float64(0), mi.Float64(0), mi.Float64(0)
-    while i < stop:
-        a = mi.Float64(dr.gather(type(x), x, i))
-        b = a - mi.Float64(dr.gather(type(y), y, i)) - md
-        a -= mx
-        sum_x += a
-        sum_d += b
-        square_x += a * a
-        square_d += b * b
-        i += channels
-    return sum_x, sum_d, square_x, square_d
+def _along(values, length):
+    """Repeat a number for each channel along a feature map."""
+    _, channel = Divisor(len(values)).split(dr.arange(mi.Int32, length))
+    return dr.gather(type(values), values, mi.UInt32(channel))
 
 
 # ---- LPIPS -------------------------------------------------------------------------------------------------

@@ -203,47 +203,19 @@ class StackedSsim:
 
     def __init__(self, reference: Tensor, weight: Tensor | None, rows: Views):
         check_image(reference, "reference")
-        width, channels = reference.shape[1:]
         self.shape = tuple(reference.shape)
-        F = type(reference.array)
-        self._parts = []
-        shares = []
-        for some in rows:
-            cut = slice(some.start * width * channels, some.stop * width * channels)
-            height = some.stop - some.start
-            own = type(reference)(_cut(reference.array, cut), (height, width, channels))
-            counts = None
-            if weight is not None:
-                depth = weight.shape[2]
-                part = slice(some.start * width * depth, some.stop * width * depth)
-                counts = type(weight)(_cut(weight.array, part), (height, width, depth))
-            self._parts.append((cut, Ssim(own, counts)))
-            shares.append(height if counts is None else float(total(counts.array)[0]) / depth / width)
-        self._shares = [dr.opaque(F, share / max(sum(shares), 1e-30)) for share in shares]
+        self._rows = rows
+        self._parts = [Ssim(reference[some], None if weight is None else weight[some]) for some in rows]
+        masses = [some.stop - some.start if weight is None else total(weight[some].array)[0] for some in rows]
+        mass = max(sum(masses), 1e-30)
+        self._shares = [dr.opaque(type(reference.array), float(part / mass)) for part in masses]
 
     def __call__(self, x: Tensor) -> DrArray:
         """Return the loss of the image ``(H, W, C)`` as a size-1 array, differentiable in ``x``."""
         if tuple(x.shape) != self.shape:
             raise InputError(f"SSIM: image {tuple(x.shape)} and reference {self.shape} differ in shape.")
-        return dr.custom(KnownGradient, x.array, self)
-
-    def _evaluate(self, x, with_gradient):
-        """As of :class:`Ssim`."""
-        loss = type(x)(0)
-        gradients = []
-        for share, (cut, part) in zip(self._shares, self._parts, strict=True):
-            value, gradient = part._evaluate(_cut(x, cut), with_gradient)
-            loss += share * value
-            gradients.append(share * gradient)
-        gradient = dr.concat(gradients)
-        dr.eval(loss, gradient)
-        return loss, gradient
-
-
-def _cut(values, part):
-    """Take a slice of a flat array."""
-    index = dr.arange(dr.uint32_array_t(type(values)), part.stop - part.start)
-    return dr.gather(type(values), dr.detach(values), index + part.start)
+        parts = zip(self._shares, self._rows, self._parts, strict=True)
+        return sum(share * ssim(x[rows]) for share, rows, ssim in parts)
 
 
 class KnownGradient(dr.CustomOp):

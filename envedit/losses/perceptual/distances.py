@@ -187,9 +187,10 @@ class _DistsTo:
                 slope = 2 / pixels * alpha * scale_1 * (mean_d - texture * mean_x)
                 slope_d = 2 / pixels * beta * scale_2
                 slope_x = -slope_d * structure
-                columns = [type(x)(c) for c in (slope - slope_d * mean_d - slope_x * mean_x, slope_d, slope_x)]
-                dr.eval(columns)
-                slope, slope_d, slope_x = (_along(column, len(value)) for column in columns)
+                slope -= slope_d * mean_d + slope_x * mean_x
+                slopes = [type(x)(column) for column in (slope, slope_d, slope_x)]
+                dr.eval(slopes)
+                slope, slope_d, slope_x = (_along(column, len(value)) for column in slopes)
                 gradients.append(slope + slope_d * (value - y) + slope_x * value)
         score = type(x)(score)
         if not with_gradient:

@@ -310,14 +310,10 @@ def high_frequency_energy(image: np.ndarray) -> float:
     """
     values = _log(luminance(_checked(image, "image")))
     height, width = values.shape
-    blurred = sum(
-        tap * values[np.clip(np.arange(height) + shift, 0, height - 1)]
-        for shift, tap in zip(range(-2, 3), _BINOMIAL, strict=True)
-    )
-    blurred = sum(
-        tap * blurred[:, (np.arange(width) + shift) % width]
-        for shift, tap in zip(range(-2, 3), _BINOMIAL, strict=True)
-    )
+    padded = np.pad(values, ((2, 2), (0, 0)), mode="edge")
+    blurred = sum(tap * padded[k : k + height] for k, tap in enumerate(_BINOMIAL))
+    padded = np.pad(blurred, ((0, 0), (2, 2)), mode="wrap")
+    blurred = sum(tap * padded[:, k : k + width] for k, tap in enumerate(_BINOMIAL))
     return float(np.mean(np.square(values - blurred)))
 
 

@@ -72,9 +72,8 @@ def warning(measured: dict) -> str:
 
 def white(envmap: np.ndarray) -> float:
     """Return the share of the upper half's solid angle whose radiance is at least 1 in all channels."""
-    half = max(1, envmap.shape[0] // 2)
-    omega = np.repeat(latlong.solid_angles(*envmap.shape[:2])[:half], envmap.shape[1])
-    bright = (envmap[:half] >= 1).all(axis=2).ravel()
+    sky, omega = _upper(envmap)
+    bright = (sky >= 1).all(axis=2)
     return float((omega * bright).sum() / omega.sum())
 
 
@@ -96,17 +95,16 @@ def patches(edited: np.ndarray, original: np.ndarray) -> float:
 
 def cells(envmap: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return log luminance (n,), direction (n, 3) and solid angle (n,) of the upper half's cells."""
-    height, width, _ = envmap.shape
-    half = max(1, height // 2)
-    shown = luminance(envmap[:half])
+    sky, omega = _upper(envmap)
+    half, width = omega.shape
+    shown = luminance(sky)
     shown = np.minimum(shown, np.quantile(shown, 1 - CLIPPED))
-    omega = np.repeat(latlong.solid_angles(height, width)[:half, None], width, axis=1)
     row = np.arange(half) * min(CELL_ROWS, half) // half
     column = np.arange(width) * min(CELL_COLUMNS, width) // width
     cell = row[:, None] * CELL_COLUMNS + column
     weight = np.bincount(cell.ravel(), omega.ravel())
     light = np.bincount(cell.ravel(), (omega * shown).ravel())
-    directions = latlong.directions(height, width)[:half].reshape(-1, 3)
+    directions = latlong.directions(len(envmap), width)[:half].reshape(-1, 3)
     centre = np.stack([np.bincount(cell.ravel(), omega.ravel() * axis) for axis in directions.T], axis=1)
     used = weight > 0
     centre = centre[used] / np.linalg.norm(centre[used], axis=1, keepdims=True)
@@ -115,18 +113,24 @@ def cells(envmap: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def colours_outside(edited: np.ndarray, known: list[np.ndarray]) -> float:
     """Return the share of the upper half's solid angle in colours that none of the known maps has."""
-    half = max(1, edited.shape[0] // 2)
-    omega = np.repeat(latlong.solid_angles(*edited.shape[:2])[:half], edited.shape[1])
-    both = np.concatenate([_chroma(envmap[:half]) for envmap in known])
+    sky, omega = _upper(edited)
+    both = np.concatenate([_chroma(_upper(envmap)[0]).reshape(-1, 3) for envmap in known])
     low, high = np.percentile(both, PERCENTILES, axis=0)
-    chroma = _chroma(edited[:half])
-    outside = ((chroma < low - MARGIN) | (chroma > high + MARGIN)).any(axis=1)
+    chroma = _chroma(sky)
+    outside = ((chroma < low - MARGIN) | (chroma > high + MARGIN)).any(axis=2)
     return float((omega * outside).sum() / omega.sum())
 
 
+def _upper(envmap):
+    """Return the upper half of a map, and the solid angle (rows, W) of its texels."""
+    height, width, _ = envmap.shape
+    half = max(1, height // 2)
+    return envmap[:half], np.repeat(latlong.solid_angles(height, width)[:half, None], width, axis=1)
+
+
 def _chroma(image):
-    logs = np.log(np.maximum(np.float64(image.reshape(-1, 3)), 1e-4))
-    return logs - logs.mean(axis=1, keepdims=True)
+    logs = np.log(np.maximum(np.float64(image), 1e-4))
+    return logs - logs.mean(axis=2, keepdims=True)
 
 
 def _step(image):

@@ -123,15 +123,15 @@ class Ssim:
         index = dr.arange(dr.uint32_array_t(type(self._y)), height * width * channels)
         return index + index // (width * channels) * ((self.shape[1] - width) * channels) + shift * channels
 
-    def _moments(self, *operands):
-        """Filter along columns: mean and variance of the first operand and, if there are two, of x - y."""
+    def _moments(self, *fields):
+        """Filter along columns: mean and variance of each field."""
         row = self.shape[1] * self.shape[2]
         F = type(self._y)
         index = dr.arange(dr.uint32_array_t(F), self.map_shape[0] * row)
-        taps = [[dr.gather(F, o, index + j * row) for j in range(len(self._rows))] for o in operands]
-        moments = list(_mean_and_variance(self._rows, taps[0]))
-        if len(taps) == 2:
-            moments += _mean_and_variance(self._rows, [x - y for x, y in zip(*taps, strict=True)])
+        moments = []
+        for field in fields:
+            taps = [dr.gather(F, field, index + j * row) for j in range(len(self._rows))]
+            moments += _mean_and_variance(self._rows, taps)
         dr.eval(moments)
         return moments
 
@@ -148,16 +148,14 @@ class Ssim:
             merged += [mean, between + sum(k * v for k, v in zip(self._columns, inner, strict=True))]
         return merged
 
-    def _terms(self, x):
-        mean_x, variance_x, mean_d, variance_d = self._window(self._moments(x, self._y))
-        scale_a = 1 / (dr.square(mean_x) + dr.square(self._mean_y) + C1)
-        scale_b = 1 / (variance_x + self._variance_y + C2)
-        return dr.square(mean_d) * scale_a, variance_d * scale_b, scale_a, scale_b, mean_x, mean_d
-
     def _evaluate(self, x, with_gradient):
         """Return the loss and, if asked for, its gradient, both without derivatives attached."""
         x = dr.detach(x)
-        a, b, scale_a, scale_b, mean_x, mean_d = self._terms(x)
+        mean_x, variance_x, mean_d, variance_d = self._window(self._moments(x, x - self._y))
+        scale_a = 1 / (dr.square(mean_x) + dr.square(self._mean_y) + C1)
+        scale_b = 1 / (variance_x + self._variance_y + C2)
+        a = dr.square(mean_d) * scale_a
+        b = variance_d * scale_b
         values = self._weight * (a + b - a * b)
         loss = type(x)(total(values))
         if not with_gradient:

@@ -119,7 +119,6 @@ class Backbone:
 
     def __init__(self, kind: str, tensors: dict[str, np.ndarray]):
         self.title = KINDS[kind][0]
-        self.kind = kind
         self.layers = KINDS[kind][1]()
         self.channels = [layer.outputs for layer in self.layers if isinstance(layer, Conv) and layer.tap]
         self._weights = [
@@ -221,7 +220,6 @@ class Stack:
     ):
         self._steps: list[Any] = []
         self._tapped: list[tuple[int, int, int]] = []
-        self.channels: list[int] = []
         channels = 3
         step: Any
         for i, layer in enumerate(layers):
@@ -234,7 +232,6 @@ class Stack:
                 )
                 if layer.tap:
                     self._tapped.append((i + 1, after[0] * after[1], channels))
-                    self.channels.append(channels)
             elif pooling == "hanning":
                 step = convolution.HanningPool(before, (*after, channels))
             else:

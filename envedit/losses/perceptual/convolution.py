@@ -48,12 +48,12 @@ class _Windows:
     Channels are read and written ``together``, by fours where there are fours; such a packet has one index.
     """
 
-    def __init__(self, before, after, kernel, stride, padding, together=None):
+    def __init__(self, before, after, kernel, stride, padding):
         self.before = before
         self.after = after[:2]
         self.kernel = kernel
         self.stride = stride
-        self.together = together or (4 if before[2] % 4 == 0 else 1)
+        self.together = 4 if before[2] % 4 == 0 else 1
         self.packets = before[2] // self.together
         sizes = *before[:2], *after[:2], stride, padding
         self._h, self._w, self._h_after, self._w_after, self._s, self._p = (
@@ -150,7 +150,6 @@ class Convolution:
         self._windows = _Windows(before, after, kernel, stride, padding)
         self._by_outputs = Divisor(after[2])
         self._rows = max(MOST_PATCHES // (after[1] * self._columns), 1)
-        self._pointwise = kernel == 1 and self._rows >= after[0]
 
     def forward(self, x: DrArray) -> DrArray:
         """Return max(W patches + bias, 0)."""
@@ -158,7 +157,7 @@ class Convolution:
         parts = []
         for first in range(0, height, self._rows):
             rows = min(self._rows, height - first)
-            patches = x if self._pointwise else self._patches(x, first, rows)
+            patches = self._patches(x, first, rows)
             product = dr.matmul(_rows_of(patches, self._columns), self._weights(type(x)), Bt=True).array
             _, channel = self._by_outputs.split(dr.arange(mi.Int32, len(product)))
             product += type(x)(dr.gather(mi.Float, self._bias, mi.UInt32(channel)))
@@ -212,19 +211,20 @@ class MaxPool:
 
     def __init__(self, kernel: int, stride: int, before: Shape, after: Shape):
         self._kernel = kernel
-        self._windows = _Windows(before, after, kernel, stride, 0, together=1)
+        self._windows = _Windows(before, after, kernel, stride, 0)
 
     def forward(self, x: DrArray) -> DrArray:
         """Return the largest of every window, NaN where it has one."""
         windows = self._windows
-        _, row, column, c = windows.outputs()
+        i, row, column, c = windows.outputs()
         best = windows.read(x, *windows.under(row, column, 0, 0, c))  # windows begin inside
         for tap in range(1, self._kernel**2):
             index, inside = windows.under(row, column, *divmod(tap, self._kernel), c)
             value = windows.read(x, index, inside)
             best = dr.select(inside & ((value > best) | dr.isnan(value)), value, best)
-        dr.eval(best)
-        return best
+        pooled = windows.write(type(x), best, i)
+        dr.eval(pooled)
+        return pooled
 
 
 class HanningPool:
@@ -254,7 +254,7 @@ class HanningPool:
         dr.eval(quotient)
         i, row, column, c = windows.inputs(0, windows.before[0])
         for y_, x_, tap_y, tap_x, inside in windows.over(row, column):
-            weight = type(x)(dr.select(tap_y == 1, 0.5, 0.25) * dr.select(tap_x == 1, 0.5, 0.25))
+            weight = type(x)(_hanning(tap_y) * _hanning(tap_x))
             total += weight * windows.read(quotient, windows.output(y_, x_, c), inside)
         pulled = windows.write(type(x), windows.read(x, i) * total, i)
         dr.eval(pulled)
@@ -263,7 +263,7 @@ class HanningPool:
 
 def _hanning(tap):
     """Weight of a tap: numpy.hanning(5)[1:-1], with sum one."""
-    return 0.5 if tap == 1 else 0.25
+    return dr.select(tap == 1, 0.5, 0.25)
 
 
 def _rows_of(values, columns):

@@ -253,7 +253,6 @@ class Lpips:
     """
 
     def __init__(self, kind: str, backbone: FilePath | Backbone, heads_file: FilePath):
-        self.kind = kind
         self.backbone = backbone if isinstance(backbone, Backbone) else Backbone.load(kind, backbone)
         shapes: dict[str, Shape] = {
             f"lin{i}.model.1.weight": (1, c, 1, 1) for i, c in enumerate(self.backbone.channels)

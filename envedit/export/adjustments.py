@@ -15,7 +15,6 @@ from envedit.core import latlong
 from envedit.core.color import luminance
 from envedit.core.errors import NumericalError
 from envedit.representations.layers import file_lights
-from envedit.representations.layers.separation import Light
 from envedit.targets.strokes import gains
 
 WIDEST = 60.0
@@ -29,7 +28,7 @@ columns a spread takes seconds and a search ten of them."""
 GROWTH = 1.05
 """Factor on that radius while the map at its own resolution is still above the bound."""
 _ROWS = 256  # of a map that are worked on at a time
-_SEARCH, _NOTHING = 20, 1e-9  # halvings of a radius; share of a peak that is rounding of a transform
+_NOTHING = 1e-9  # share of a peak that is rounding of a transform
 
 
 def adjust(
@@ -146,13 +145,6 @@ def flux_ratio(before: np.ndarray, after: np.ndarray) -> np.ndarray:
     return np.where(fluxes[1] > 0, fluxes[0] / np.where(fluxes[1] > 0, fluxes[1], 1), 1)
 
 
-def _core(light: Light, shape: tuple[int, ...], degrees: float) -> np.ndarray:
-    """Return a light (H, W, 3), black elsewhere, spread over a disc."""
-    core = np.zeros(shape, np.float32)
-    core.reshape(-1, 3)[light.texels] = light.radiance
-    return spread(core, degrees) if degrees else core
-
-
 def _soften(envmap, degrees, most):
     """Soften the lights of a map in place and bound what it shows; ``most`` 0: no bound. Returns notes."""
     lights = file_lights.lights_of(envmap)
@@ -161,7 +153,10 @@ def _soften(envmap, degrees, most):
         notes = ["no light was found: lights.soften_degrees changes nothing"]
     file_lights.take_out(envmap, lights)
     for i, light in enumerate(lights):
-        core = _core(light, envmap.shape, degrees)
+        core = np.zeros(envmap.shape, np.float32)
+        core.reshape(-1, 3)[light.texels] = light.radiance
+        if degrees:
+            core = spread(core, degrees)
         if most:
             core, radius = _bounded(core, envmap, most)
             if radius:
@@ -188,12 +183,10 @@ def _bounded(core, others, most):
         size = SEARCH_WIDTH // 2, SEARCH_WIDTH
         small, behind = (latlong.resize(image, *size) for image in (core, others))
     low, high = np.log(180 / len(core)), np.log(WIDEST)
-    for _ in range(_SEARCH):
+    while high - low >= 0.01:
         middle = (low + high) / 2
         exceeds = _exceeds(spread(small, np.exp(middle)), behind, most)
         low, high = (middle, high) if exceeds else (low, middle)
-        if high - low < 0.01:
-            break
     radius = float(np.exp(high))
     while _exceeds(result := spread(core, radius), others, most) and radius * GROWTH < WIDEST:
         radius *= GROWTH

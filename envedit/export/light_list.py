@@ -196,23 +196,15 @@ def matched(
     moved = np.degrees(np.arccos(np.clip(start @ end.T, -1, 1)))
 
     # ---- Number them: those before, then those added
-    removed = [j is None for j in partner]
-    numbered = [{"id": i + 1, "removed": removed[i], **light} for i, light in enumerate(before)]
-    owner = {j: i for i, j in enumerate(partner) if j is not None}
-    others = [j for j in range(len(after)) if j not in owner]
-    ids = {j: i + 1 for j, i in owner.items()} | {j: len(before) + 1 + k for k, j in enumerate(others)}
-    return {
-        "before": numbered,
-        "after": [
-            {
-                "id": ids[j],
-                "added": j not in owner,
-                "moved_degrees": float(moved[owner[j], j]) if j in owner else None,
-                **light,
-            }
-            for j, light in enumerate(after)
-        ],
-    }
+    numbered = [{"id": i + 1, "removed": partner[i] is None, **light} for i, light in enumerate(before)]
+    found = [{"id": 0, "added": True, "moved_degrees": None, **light} for light in after]
+    for i, j in enumerate(partner):
+        if j is not None:
+            found[j] |= {"id": i + 1, "added": False, "moved_degrees": float(moved[i, j])}
+    added = [light for light in found if light["added"]]
+    for number, light in enumerate(added, len(before) + 1):
+        light["id"] = number
+    return {"before": numbered, "after": found}
 
 
 def summary(lights: dict[str, list[dict]], height: int) -> str | None:

@@ -71,15 +71,26 @@ class MovedLights:
         flux = soft * np.divide(flux.sum(axis=0), kept, out=np.ones(3), where=kept > 0)
         for k in range(0, len(row), POINTS_AT_ONCE):
             part = slice(k, k + POINTS_AT_ONCE)
-            self._place_some(light, row[part], column[part], flux[part], omega[row[part]])
+            self._place(light, row[part], column[part], flux[part], omega[row[part]])
 
-    def _place_some(self, light, row, column, flux, omega):
+    def _place(self, light, row, column, flux, omega):
         if len(row) == 1:  # a single one would be a scalar, and another kernel
             row, column, flux, omega = (np.repeat(v, 2, axis=0) for v in (row, column, flux / 2, omega / 2))
-        d = lights.points(row, column, self.height, self.width)
-        sine = np.sin(np.pi * row / max(self.height - 1, 1))
-        size = float(lights.size_factor(self.size[light, 0]))
-        self._place(light, d, flux, sine, max(1.0, size), omega * size**2)
+        factor = float(lights.size_factor(self.size[light, 0]))
+        half_row = max(1.0, factor)
+        flux = flux * lights.flux_factor(self.flux[light])
+        point = _columns(mi.Vector3f, lights.points(row, column, self.height, self.width))
+        size = dr.opaque(mi.Float, factor)
+        centre = _opaque(mi.Vector3f, self.layers.lights.centres[light])
+        turn = _opaque(mi.Vector3f, self.turn[light])
+        sine = flat(mi.Float, np.sin(np.pi * row / max(self.height - 1, 1)).astype(np.float32)) * size
+        places = lights.placed(point, centre, turn, size, sine, 1.0, (self.height, self.width))
+        dr.eval(places)
+        reach = places[0].numpy()
+        first, last = int(np.floor(reach.min() - half_row)), int(np.ceil(reach.max() + half_row))
+        omega = mi.Color3f(flat(mi.Float, (omega * factor**2).astype(np.float32)))
+        flux = _columns(mi.Color3f, flux)
+        self.points.append(_Points(int(light), places, flux, omega, half_row, first, last))
 
     def place_lobe(self, light: int) -> None:
         """Place a light that was added: radiance that falls off as a Gaussian of the angle."""
@@ -107,21 +118,6 @@ class MovedLights:
         """Yield the radiance of each light that was added, at directions."""
         for centre, radius, peak in self.lobes:
             yield peak * _lobe(dr.norm(d - centre) * dr.opaque(mi.Float, 1 / radius), dr)
-
-    def _place(self, light, d, flux, sine, half_row, omega):
-        scale = lights.flux_factor(self.flux[light])
-        point = mi.Vector3f(*(flat(mi.Float, v) for v in d.T.astype(np.float32)))
-        flux = mi.Color3f(*(flat(mi.Float, v) for v in (flux * scale).T.astype(np.float32)))
-        size = dr.opaque(mi.Float, float(lights.size_factor(self.size[light, 0])))
-        centre = _opaque(mi.Vector3f, self.layers.lights.centres[light])
-        turn = _opaque(mi.Vector3f, self.turn[light])
-        sine = flat(mi.Float, sine.astype(np.float32)) * size
-        places = lights.placed(point, centre, turn, size, sine, 1.0, (self.height, self.width))
-        dr.eval(places)
-        row = places[0].numpy()
-        first, last = int(np.floor(row.min() - half_row)), int(np.ceil(row.max() + half_row))
-        omega = mi.Color3f(flat(mi.Float, omega.astype(np.float32)))
-        self.points.append(_Points(int(light), places, flux, omega, half_row, first, last))
 
     def level(self, grid: Places) -> None:
         """Find what makes up for the flux that dividing by the density takes or gives."""
@@ -164,6 +160,11 @@ def _lobe(angle, library):
     """Return a Gaussian of an angle in radii, in numpy or in Dr.Jit."""
     where = np.where if library is np else dr.select
     return where(angle < REACH, library.exp(-0.5 * library.square(angle)), 0)
+
+
+def _columns(kind, values):
+    """Copy the columns of (n, 3) to a vector or a colour."""
+    return kind(*(flat(mi.Float, column) for column in values.T.astype(np.float32)))
 
 
 def _opaque(kind, values):

@@ -36,7 +36,7 @@ class Ratio:
         height, width = grid.shape
         whole = np.shape(edited)[:2]
         self.same_size = height <= whole[0] or width <= whole[1]
-        self._overlaps(whole, rows)
+        self._overlaps(whole)
         if self.same_size:
             target = np.asarray(edited) if grid.shape == whole else latlong.resize(edited, height, width)
             self.target = np.asarray(target, np.float32)
@@ -56,13 +56,12 @@ class Ratio:
         self.fix = np.ones(self.m.shape), np.zeros(self.m.shape)
         self.fixed = False
 
-    def _overlaps(self, whole, rows):
-        """Find the working rows and columns that the source's overlap, and the weights of a mean."""
+    def _overlaps(self, whole):
+        """Find the first and the last working row and column that each of the source's overlaps."""
         (height, width), (total, columns) = self.grid.shape, whole
         # As latlong.row_edges has them, in rows of the working map.
-        edges = (
-            np.clip((np.arange(height + 1) - 0.5) * ((total - 1) / (height - 1)), 0, total - 1) - rows.start
-        )
+        edges = np.clip((np.arange(height + 1) - 0.5) * ((total - 1) / (height - 1)), 0, total - 1)
+        edges -= self.grid.rows.first
         few = height < 2 * total
         low, high = np.floor(edges[:-1] + 0.5 + 1e-9), np.ceil(edges[1:] - 0.5 - 1e-9)
         self.rows = [np.asarray(self.grid.row if few else v, np.int64) for v in (low, high)]
@@ -70,14 +69,6 @@ class Ratio:
         few = width < 2 * columns
         low, high = np.floor(across[:-1] + 1e-9), np.ceil(across[1:] - 1e-9) - 1
         self.columns = [np.asarray(self.grid.column if few else v, np.int64) for v in (low, high)]
-        v = latlong.row_edges(height)
-        target = latlong.row_edges(total)[rows.start : rows.stop + 1]
-        cap = np.sin(np.pi / 2 * np.clip(v, target[:-1, None], target[1:, None])) ** 2
-        weights = np.diff(cap, axis=1)
-        self.down = (weights / weights.sum(axis=1, keepdims=True)).astype(np.float32)
-        target = np.arange(columns + 1) / columns
-        weights = np.diff(np.clip(np.arange(width + 1) / width, target[:-1, None], target[1:, None]), axis=1)
-        self.over = (weights / weights.sum(axis=1, keepdims=True)).T
 
     def correct(self, source: np.ndarray) -> None:
         """Correct m and a until the means of the changed working texels are the edited map's."""
@@ -85,7 +76,8 @@ class Ratio:
             return
         least = LEAST * float(self.want.mean())
         for step in range(sum(ROUNDS)):
-            mean = self._means(source)
+            mean = latlong.resize(self._composed(source), self.grid.rows.total, self.grid.columns)
+            mean = mean[self.grid.rows.slice]
             off = np.abs(mean - self.want) > TOLERANCE * np.maximum(self.want, least)
             off &= self.changed[..., None]
             if not off.any():
@@ -100,28 +92,12 @@ class Ratio:
                 self.fix = (self.fix[0] * m, self.fix[1] * m + a)
                 self.fixed = True
 
-    def _means(self, source):
-        """Mean of the result over each active working texel, as :func:`.latlong.resize` makes it."""
-        height, width = self.grid.shape
-        sums = np.zeros((*self.changed.shape, 3))
+    def _composed(self, source):
+        """Compose the whole source."""
+        result = source.copy()
         for start, fresh, size in self.grid.bands():
-            composed = self.band(source[start : start + size], start)[fresh - start :]
-            sums += self._mean_of(composed, fresh)
-        # Rows that reach out of the active ones: what lies there is the source's.
-        for part in (range(max(self.grid.start - 1, 0), self.grid.start), range(self.grid.stop, height)):
-            for row in part:
-                if not self.down[:, row].any():
-                    break
-                sums += self._mean_of(source[row : row + 1], row)
-        return sums
-
-    def _mean_of(self, composed, start):
-        weights = self.down[:, start : start + len(composed)]
-        used = np.flatnonzero(weights.any(axis=1))
-        result = np.zeros((*self.changed.shape, 3))
-        if len(used):
-            part = (weights[used] @ composed.reshape(len(composed), -1)).reshape(len(used), -1, 3)
-            result[used] = np.einsum("rwc,wk->rkc", part.astype(np.float64), self.over, optimize=True)
+            band = self.band(source[start : start + size], start)
+            result[fresh : start + size] = band[fresh - start :]
         return result
 
     def band(self, source: np.ndarray, start: int) -> np.ndarray:

@@ -9,7 +9,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from envedit.core.atomic_files import replacing
 from envedit.core.errors import InputError
+from envedit.core.primaries import REC709, Chromaticities
 from envedit.core.processor import cores
 from envedit.core.quiet_libraries import quiet_libraries
 from envedit.core.types import Info
@@ -121,6 +123,36 @@ def read(name: str, head: bytes, info: Info, stored: bool) -> np.ndarray:
     image = np.stack(planes if stored or len(planes) == 3 else planes * 3, axis=-1)
     _describe(header, info)
     return _to_display(image, (left, top), display, name, info)
+
+
+def write(
+    name: str,
+    planes: dict[str, np.ndarray],
+    chromaticities: Chromaticities | None = None,
+    panorama: bool = True,
+    metadata: dict | None = None,
+) -> None:
+    """Write channels (H, W) by name, whole or not at all; other arguments as of :func:`.images.write_exr`.
+
+    Channels are float32, or half.
+    """
+    import OpenEXR
+
+    import envedit
+
+    header = {
+        "compression": OpenEXR.ZIP_COMPRESSION,
+        "type": OpenEXR.scanlineimage,
+        "chromaticities": chromaticities or REC709,
+        **({"envmap": OpenEXR.ENVMAP_LATLONG} if panorama else {}),
+        "software": f"envedit {envedit.__version__}",
+    }
+    for key, value in (metadata or {}).items():
+        plain = isinstance(value, float) or type(value) is int and abs(value) < 2**31
+        header[key] = value if plain else str(value)
+    planes = {channel: np.ascontiguousarray(values) for channel, values in planes.items()}
+    with replacing(name, ".exr") as temporary, quiet_libraries(), on_cores():
+        OpenEXR.File(header, planes).write(str(temporary))
 
 
 @contextlib.contextmanager

@@ -13,9 +13,8 @@ import zlib
 import numpy as np
 
 from envedit.core import latlong, primaries, radiance
-from envedit.core.atomic_files import replacing, write_atomically
+from envedit.core.atomic_files import write_atomically
 from envedit.core.errors import ConfigError, EnveditError, InputError, NumericalError, place_of
-from envedit.core.quiet_libraries import quiet_libraries
 from envedit.core.types import ArrayLike, FilePath, Info
 from envedit.images import exr, ldr, marks, rgbe, tiff
 from envedit.images.headers import MAX_SIDE, damaged, head_of
@@ -316,34 +315,15 @@ def write_exr(
     InputError
         If the file cannot be written.
     """
-    import OpenEXR
-
-    import envedit
-
     name = os.fsdecode(path)
     pixels = _checked(name, image)
-
-    # ---- Header
-    header = {
-        "compression": OpenEXR.ZIP_COMPRESSION,
-        "type": OpenEXR.scanlineimage,
-        "chromaticities": chromaticities or primaries.REC709,
-        **({"envmap": OpenEXR.ENVMAP_LATLONG} if panorama else {}),
-        "software": f"envedit {envedit.__version__}",
-    }
-    for key, value in (metadata or {}).items():
-        plain = isinstance(value, float) or type(value) is int and abs(value) < 2**31
-        header[key] = value if plain else str(value)
-
-    # ---- Channels
     if half:
         with np.errstate(over="ignore"):  # refused as an infinity
             pixels = _checked(name, pixels.astype(np.float16)).astype(np.float16)
-    planes = {c: np.ascontiguousarray(pixels[..., i]) for i, c in enumerate("RGB")}
+    planes = {channel: pixels[..., i] for i, channel in enumerate("RGB")}
     if alpha is not None:
-        planes["A"] = np.ascontiguousarray(alpha, np.float32)
-    with replacing(name, ".exr") as temporary, quiet_libraries(), exr.on_cores():
-        OpenEXR.File(header, planes).write(str(temporary))
+        planes["A"] = np.asarray(alpha, np.float32)
+    exr.write(name, planes, chromaticities, panorama, metadata)
 
 
 def write_hdr(

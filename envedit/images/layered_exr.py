@@ -6,12 +6,10 @@ import os
 
 import numpy as np
 
-from envedit.core.atomic_files import replacing
 from envedit.core.errors import NumericalError, place_of
-from envedit.core.primaries import REC709, Chromaticities
-from envedit.core.quiet_libraries import quiet_libraries
+from envedit.core.primaries import Chromaticities
 from envedit.core.types import FilePath
-from envedit.images.exr import on_cores
+from envedit.images import exr
 
 DEFAULT = "edited"
 """The layer that is written as plain R, G, B: what a program shows that knows of no layers."""
@@ -43,11 +41,7 @@ def write(
     InputError
         If the file cannot be written.
     """
-    import OpenEXR
-
     name = os.fsdecode(path)
-
-    # ---- Channels of each layer
     default = DEFAULT if DEFAULT in layers else next(iter(layers))
     planes = {}
     size = np.shape(layers[default])[:2]
@@ -61,17 +55,8 @@ def write(
         values = _finite(name, layer, values)
         prefix = "" if layer == default else f"{layer}."
         for i, channel in enumerate("RGB" if colour else "Y"):
-            planes[prefix + channel] = np.ascontiguousarray(values[..., i] if colour else values)
-
-    # ---- Header, and the file
-    header = {
-        "compression": OpenEXR.ZIP_COMPRESSION,
-        "type": OpenEXR.scanlineimage,
-        "chromaticities": chromaticities or REC709,
-        "envmap": OpenEXR.ENVMAP_LATLONG,
-    }
-    with replacing(name, ".exr") as temporary, quiet_libraries(), on_cores():
-        OpenEXR.File(header, planes).write(str(temporary))
+            planes[prefix + channel] = values[..., i] if colour else values
+    exr.write(name, planes, chromaticities)
 
 
 def _finite(name, layer, values):

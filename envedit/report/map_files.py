@@ -12,7 +12,7 @@ from envedit import config, inputs
 from envedit.core import atomic_files, primaries
 from envedit.core.errors import InputError
 from envedit.export import light_list
-from envedit.images import images, layered_exr
+from envedit.images import images
 from envedit.maps import look_transfer, looks, map_file, usd_scene
 from envedit.report import manifest
 from envedit.scene import scene
@@ -30,21 +30,17 @@ def write_map(
     ``path`` is the file without its ending; ``envmap`` (H, W, 3) has linear values in the units and colours
     of the file that was edited, ``input_map``.
     """
-    source = {"source": input_map.source}
     space = input_map.chromaticities
     if settings.format == "hdr":  # its colours are Rec. 709 to nearly every program
         shown = envmap if space is None else primaries.converted(envmap, primaries.to_rec709(space))
         images.write_hdr(path.with_suffix(".hdr"), shown)
         return []
     name = path.with_suffix(".exr")
-    if not settings.half:
-        if path.name == "edited":
-            images.write_exr(name, envmap, source, chromaticities=space)
-        else:
-            layered_exr.write(name, {"edited": envmap}, chromaticities=space)  # on all cores
-        return []
-    cut, warnings = map_file.cut_to_half(envmap, name, "set output.half = false")
-    images.write_exr(name, cut, source, half=True, chromaticities=space)
+    warnings: list[str] = []
+    if settings.half:
+        envmap, warnings = map_file.cut_to_half(envmap, name, "set output.half = false")
+    source = {"source": input_map.source}
+    images.write_exr(name, envmap, source, half=settings.half, chromaticities=space)
     return warnings
 
 

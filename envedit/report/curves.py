@@ -16,19 +16,17 @@ DECADES = 12
 """Of the axis, at most, below the largest value."""
 LABEL_CHARACTERS = 16
 """Characters of a name beside its curve, at most."""
-_TIMES = ("_s", "_ms", "time", "seconds")
-_NOT_LOSSES = ("iteration", "step", "epoch", "lr", "damping", "sigma", "non_finite", "skipped")
+WIDTH, HEIGHT = 860, 340
+"""Of the drawing, in its own units."""
+_NOT_LOSSES = ("iteration", "lr", "step_ms")
 
 
-def curves_svg(rows: list[dict], width: int = 860, height: int = 340) -> str:
+def curves_svg(rows: list[dict]) -> str:
     """Draw every loss column of a history on a logarithmic axis against the iteration, as an SVG element.
 
-    Columns that are no losses (iteration, learning rates, times) are left out, and so is what a logarithm
-    cannot show: a value that is missing, not finite, zero or negative interrupts its line. An empty string
-    where there is nothing to draw.
-
-    Losses that are in units of a ``sigma`` which changes from row to row cannot be compared: ``residual`` is
-    drawn in their place.
+    A value that is missing, not finite, zero or negative interrupts its line. An empty string where there is
+    nothing to draw. Losses that are in units of a ``sigma`` which changes from row to row cannot be compared:
+    ``residual`` is drawn in their place.
     """
     series = _series(rows)
     if not series:
@@ -42,7 +40,7 @@ def curves_svg(rows: list[dict], width: int = 860, height: int = 340) -> str:
     high = max(values)
     low = max(min(values), high - DECADES)
     margin = max(0.04 * (high - low), 0.01)
-    left, right, top, bottom = 64, width - 190, 12, height - 28
+    left, right, top, bottom = 64, WIDTH - 190, 12, HEIGHT - 28
 
     def across(x):
         return left + (x - start) / max(end - start, 1) * (right - left)
@@ -52,7 +50,7 @@ def curves_svg(rows: list[dict], width: int = 860, height: int = 340) -> str:
 
     decades = range(math.ceil(low + 2 * margin), math.floor(high - 2 * margin) + 1)
     drawn = [
-        f'<svg class="curves" viewBox="0 0 {width} {height}" role="img" aria-label="losses by iteration">'
+        f'<svg class="curves" viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="losses by iteration">'
     ]
     for y in sorted({low, *decades, high}):
         drawn.append(f'<path class="grid" d="M{left} {down(y):.1f}H{right}"/>')
@@ -81,13 +79,11 @@ def curves_svg(rows: list[dict], width: int = 860, height: int = 340) -> str:
 
 def _series(rows):
     """Return the (iteration, decimal logarithm or None) of each loss, by its name."""
-    names = columns(rows)
+    names = [name for name in columns(rows) if name not in _NOT_LOSSES]
     if {"sigma", "residual"} <= set(names):
         names = ["residual"]
     series = {}
     for name in names:
-        if name in _NOT_LOSSES or name.startswith(("lr_", "weight")) or name.endswith(_TIMES):
-            continue
         points = []
         for i, row in enumerate(rows):
             step = number(row.get("iteration", i))
@@ -109,8 +105,8 @@ def normalised(rows: list[dict], ramps: dict, iterations: int) -> tuple[list[dic
     A weight that rises during a run lets the loss rise while the rendering improves: values of different
     iterations can be compared only under the same weights.
 
-    A row of an iteration has ``iteration``, ``loss``, and the weighted terms that it is the sum of;
-    ``ramps`` has the first and last weight of each, which change over so many iterations.
+    Each row has ``iteration``, ``loss``, and the weighted terms that it is the sum of; ``ramps`` has the
+    first and last weight of each, which change over so many ``iterations``.
     """
     names = columns(rows)
     if {"sigma", "residual"} <= set(names):

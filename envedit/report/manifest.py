@@ -91,17 +91,10 @@ def columns(rows: Iterable[dict]) -> list[str]:
 def manifest(config_summary: dict, inputs: dict, variant: str) -> dict:
     """Collect what it takes to explain a run later: versions, machine, seeds, and the digests of its inputs.
 
-    ``commit`` is None unless the package runs from its own git checkout.
-
-    Parameters
-    ----------
-    config_summary : dict
-        Whatever of the configuration is worth repeating; its keys that name a seed are listed as ``seeds``.
-    inputs : dict of str to path or None
-        Files read, by role. None is left out; a file that cannot be read any more is listed with the reason.
-    variant : str
-        Mitsuba variant.
-        Mitsuba variant.
+    ``config_summary`` is whatever of the configuration is worth repeating; its keys that name a seed are
+    listed as ``seeds``. ``inputs`` are the files read, by role: None is left out, and a file that cannot be
+    read any more is listed with the reason. ``variant`` is Mitsuba's. ``commit`` is None unless the package
+    runs from its own git checkout.
     """
     versions: dict[str, str | None] = {"envedit": envedit.__version__, "python": platform.python_version()}
     for package in ("mitsuba", "drjit", "numpy", "OpenEXR"):

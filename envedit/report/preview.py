@@ -168,22 +168,14 @@ def difference_image(
 ) -> tuple[np.ndarray, float]:
     """Draw the difference a - b in luminance: red where a is brighter, blue where it is darker.
 
-    Parameters
-    ----------
-    a, b : ndarray (H, W, 3)
-        Linear radiance.
-    kind : "tonemapped" or "stops"
-        Difference of the luminance under ``tonemap``, for renderings; or log2 of the ratio of luminances, for
-        maps, whose sun a tonemap clips. There both are lifted by a thousandth of b's median, so that a black
-        texel is dark and not minus infinity.
+    ``a`` and ``b`` (H, W, 3) are linear radiance. ``kind`` is "tonemapped", the difference of the luminance
+    under ``tonemap``, for renderings; or "stops", log2 of the ratio of luminances, for maps, whose sun a
+    tonemap clips. There both are lifted by a thousandth of b's median, so that a black texel is dark and not
+    minus infinity.
 
-    Returns
-    -------
-    pixels : ndarray (H, W, 3) uint8
-        At most :data:`WIDEST` across.
-    scale : float
-        Difference drawn in full red or blue: the 99.5th percentile, rounded up to 1, 2 or 5 times a power of
-        ten, and at least 0.01 (tonemapped) or 0.1 (stops): rounding is no edit.
+    Returns pixels (H, W, 3) uint8, at most :data:`WIDEST` across, and the difference that is drawn in full
+    red or blue: the 99.5th percentile, rounded up to 1, 2 or 5 times a power of ten, and at least 0.01
+    (tonemapped) or 0.1 (stops), as rounding is no edit.
     """
     size = _shown_size(a)
     a = fit(a, *size).astype(np.float64)

@@ -51,12 +51,7 @@ class Variant:
     @property
     def measures(self) -> dict:
         """What metrics.json has of it."""
-        return {
-            "name": self.name,
-            "evidence": self.evidence,
-            "towards": self.towards,
-            "elsewhere": self.elsewhere,
-        }
+        return {key: getattr(self, key) for key in ("name", "evidence", "towards", "elsewhere")}
 
 
 def rendered(
@@ -75,15 +70,13 @@ def rendered(
     """
     render = scene.render(edited, SPP, seed)
     seen = None if scene.alpha is None else scene.alpha > 0
-    followed = metrics.painted(render, target.picture, target.initial, target.coverage, tonemap, seen)
     return Variant(
         name=explanation.name,
         evidence=explanation.score,
         envmap=stored,
         render=render,
-        towards=followed["towards"],
-        elsewhere=followed["elsewhere"],
         run=explanation.run,
+        **metrics.painted(render, target.picture, target.initial, target.coverage, tonemap, seen),
     )
 
 

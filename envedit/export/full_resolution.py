@@ -17,7 +17,7 @@ from envedit.core.rows import Rows
 from envedit.export.moved_lights import MovedLights
 from envedit.export.ratio_transfer import Ratio
 from envedit.export.source_cores import SourceCores
-from envedit.export.texel_maps import Places, as_colours, as_image
+from envedit.export.texel_maps import Places
 from envedit.representations.base import Representation
 from envedit.representations.layers import lights
 from envedit.representations.layers.composition import Fields, Glows, compose
@@ -97,19 +97,19 @@ def carry(
 
     # ---- Apply it to bands of rows
     result = source.copy()
-    for start, fresh, size in grid.bands():
-        band = slice(start, start + size)
-        composed = work.band(source[band], start)
+    for band in grid.bands():
+        original = source[band.rows]
+        composed = work.band(band, original)
         if representation.models_edit:
-            composed = unseen_kept(source[band], composed)
+            composed = unseen_kept(original, composed)
         if free is not None:
-            composed = np.where(free[grid.row[band]][:, grid.column][..., None], composed, source[band])
+            composed = np.where(free[grid.row[band.rows]][:, grid.column][..., None], composed, original)
         if (bad := ~np.isfinite(composed)).any():
             raise NumericalError(
-                f"the edit at full resolution is not finite at {place_of(bad, start)}; lower "
+                f"the edit at full resolution is not finite at {place_of(bad, band.start)}; lower "
                 "[optimizer] lr if you have raised it, else scale the map down"
             )
-        result[fresh : start + size] = composed[fresh - start :]
+        result[band.fresh : band.stop] = composed[band.fresh - band.start :]
     return result
 
 
@@ -168,19 +168,17 @@ class _LayersAt:
     def collect(self, source):
         """Gather the texels of lights that move, and place them."""
         texels: dict[int, list] = {int(i): [] for i in self._leaving}
-        for start, fresh, size in self.grid.bands() if texels else ():
-            if not self.cores.any(start, size):
+        for band in self.grid.bands() if texels else ():
+            if not self.cores.any(band):
                 continue
-            row, column = self.grid.texels(size)
-            directions = self.cores.directions(start, row, column)
-            image = as_colours(source[start : start + size])
-            light, share, core = self.cores.of(image, row, column, directions, start, size)
-            light, share = (v.numpy().reshape(size, self.grid.shape[1]) for v in (light, share))
-            core = as_image(core, size, self.grid.shape[1]).numpy()
-            light[: fresh - start] = -1
+            directions = self.cores.directions(band)
+            light, share, core = self.cores.of(band, band.colours(source[band.rows]), directions)
+            light, share = (v.numpy().reshape(band.shape) for v in (light, share))
+            core = band.image(core).numpy()
+            light[: band.fresh - band.start] = -1
             for i, parts in texels.items():
                 r, c = np.nonzero(light == i)
-                parts.append((r + start, c, core[r, c], share[r, c]))
+                parts.append((r + band.start, c, core[r, c], share[r, c]))
         for i, parts in texels.items():
             if any(part[2].any() for part in parts):
                 self.moved.place_texels(i, *(np.concatenate(p) for p in zip(*parts, strict=True)))
@@ -190,26 +188,23 @@ class _LayersAt:
                 self.moved.place_lobe(spare)
         self.moved.level(self.grid)
 
-    def band(self, source, start):
-        """Compose the rows of a source that begin at ``start``."""
-        size = len(source)
-        image = as_colours(source)
-        row, column = self.grid.texels(size)
-        directions = self.cores.directions(start, row, column)
+    def band(self, band, source):
+        """Compose the rows of a band, which are ``source``."""
+        image = band.colours(source)
+        directions = self.cores.directions(band)
 
         # ---- The source without its cores, and those of lights that stay
         base = image
         core = None
-        if self.cores.any(start, size):
-            light, _, own_core = self.cores.of(image, row, column, directions, start, size)
+        if self.cores.any(band):
+            light, _, own_core = self.cores.of(band, image, directions)
             base = image - own_core
             which = dr.select(light < 0, dr.opaque(mi.Int32, self.layers.lights.own), light)
             strength = dr.gather(mi.Color3f, self.strength, mi.UInt32(which))
             core = own_core * strength
 
         # ---- The sky
-        fields = self._fields_at(directions, start, size, row, column)
-        sky = compose(base, directions, fields).sky
+        sky = compose(base, directions, self._fields_at(band, directions)).sky
         same = sky == base
         if core is not None:
             sky += core
@@ -219,23 +214,19 @@ class _LayersAt:
         # ---- Lights that have moved or were added
         for lobe in self.moved.lobes_at(directions):
             sky += lobe
-        edited = as_image(sky, size, self.grid.shape[1])
-        for radiance in self.moved.radiance(start, size):
+        edited = band.image(sky)
+        for radiance in self.moved.radiance(band):
             edited += radiance
         return edited.numpy()
 
-    def _fields_at(self, directions, start, size, row, column):
+    def _fields_at(self, band, directions):
         """Interpolate what the edit does at the texels of a band."""
 
         def smooth(field):
-            table = flat(mi.Float, self.grid.smooth_rows(field, start, size, self.edge))
-            return self.grid.smooth_across(mi.Color3f, table, row, column)
+            return self.grid.smooth(band, field, self.edge)
 
-        follows = self.cores.follow(start, row)
-        share = None
-        if self.free is not None:
-            inner = flat(mi.Float, self.grid.inner(self.free, start, size))
-            share = self.grid.across(mi.Float, inner, row, column, corners=True)
+        follows = self.cores.follow(band)
+        share = None if self.free is None else self.grid.inside(band, self.free)
         log_saturation = self.log_saturation
         if log_saturation is not None and not self.layers.mirrored:
             log_saturation = dr.select(follows, 0, log_saturation)

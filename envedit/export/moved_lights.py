@@ -16,7 +16,7 @@ import numpy as np
 from envedit.core import latlong
 from envedit.core.arrays import flat
 from envedit.core.rotations import rotated
-from envedit.export.texel_maps import Places
+from envedit.export.texel_maps import Band, Places
 from envedit.representations.layers import lights
 from envedit.representations.layers.layers import Layers
 
@@ -123,36 +123,34 @@ class MovedLights:
         """Find what makes up for the flux that dividing by the density takes or gives."""
         flux = {p.light: np.zeros((2, 3)) for p in self.points}
         omega = latlong.lookup_solid_angles(self.height, self.width)
-        for start, fresh, size in grid.bands():
-            for light in self._reaching(start, size):
-                total, density = self._shared_out(light, start, size)
+        for band in grid.bands():
+            for light in self._reaching(band):
+                total, density = self._shared_out(light, band)
                 for k, image in enumerate((total, total / density)):
-                    rows = image.numpy()[fresh - start :].sum(axis=1, dtype=np.float64)
-                    flux[light][k] += omega[fresh : start + size] @ rows
+                    rows = image.numpy()[band.fresh - band.start :].sum(axis=1, dtype=np.float64)
+                    flux[light][k] += omega[band.fresh : band.stop] @ rows
         for light, (target, got) in flux.items():
             self._level[light] = np.where(got > 0, target / np.maximum(got, 1e-300), 1).astype(np.float32)
 
-    def radiance(self, start: int, size: int) -> Iterator[mi.TensorXf]:
-        """Yield the radiance (size, W, 3) of each light that reaches the band of rows from ``start``."""
-        for light in self._reaching(start, size):
+    def radiance(self, band: Band) -> Iterator[mi.TensorXf]:
+        """Yield the radiance (size, W, 3) of each light that reaches a band."""
+        for light in self._reaching(band):
             # Points on a turned grid lie closer here and farther there: a pattern of fine stripes, otherwise.
-            total, density = self._shared_out(light, start, size)
+            total, density = self._shared_out(light, band)
             level = flat(mi.Float, self._level[light])
             yield total / density * dr.reshape(mi.TensorXf(level), (1, 1, 3))
 
-    def _reaching(self, start, size):
-        return sorted({p.light for p in self.points if p.first < start + size and p.last >= start})
+    def _reaching(self, band):
+        return sorted({p.light for p in self.points if p.first < band.stop and p.last >= band.start})
 
-    def _shared_out(self, light, start, size):
+    def _shared_out(self, light, band):
         """Share out the points of a light in a band: radiance, and its density, which should be 1."""
         total, density = 0, 0
+        rows = band.start, self.height
         for p in self.points:
-            if p.light == light and p.first < start + size and p.last >= start:
-                row, column, half = p.places
-                shape = (size, self.width)
-                rows = (start, self.height)
-                total += lights.shared_out(row, column, half, p.flux, p.half_row, shape, rows)
-                density += lights.shared_out(row, column, half, p.omega, p.half_row, shape, rows)
+            if p.light == light and p.first < band.stop and p.last >= band.start:
+                total += lights.shared_out(*p.places, p.flux, p.half_row, band.shape, rows)
+                density += lights.shared_out(*p.places, p.omega, p.half_row, band.shape, rows)
         return total, dr.clip(density, 0.5, 2)
 
 

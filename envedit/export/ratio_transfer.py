@@ -11,7 +11,7 @@ import numpy as np
 
 from envedit.core import latlong
 from envedit.core.arrays import flat
-from envedit.export.texel_maps import Places, as_image
+from envedit.export.texel_maps import Band, Places
 
 MODERATE = 4.0
 """Largest ratio by which a texel of the source is scaled."""
@@ -95,59 +95,46 @@ class Ratio:
     def _composed(self, source):
         """Compose the whole source."""
         result = source.copy()
-        for start, fresh, size in self.grid.bands():
-            band = self.band(source[start : start + size], start)
-            result[fresh : start + size] = band[fresh - start :]
+        for band in self.grid.bands():
+            composed = self.band(band, source[band.rows])
+            result[band.fresh : band.stop] = composed[band.fresh - band.start :]
         return result
 
-    def band(self, source: np.ndarray, start: int) -> np.ndarray:
-        """Compose the rows of a source that begin at ``start``."""
+    def band(self, band: Band, source: np.ndarray) -> np.ndarray:
+        """Compose the rows of a band, which are ``source``."""
         # ---- Texels of the band whose working texel changes
-        size = len(source)
-        low, high = (r[start : start + size] for r in self.rows)
+        low, high = (r[band.rows] for r in self.rows)
         inside = (low >= 0) & (high < len(self.changed))
-        top, bottom = (self.changed[np.clip(r, 0, len(self.changed) - 1)] for r in (low, high))
-        changed = top & bottom & inside[:, None]
+        low, high = (np.clip(r, 0, len(self.changed) - 1) for r in (low, high))
+        changed = self.changed[low] & self.changed[high] & inside[:, None]
         changed = changed[:, self.columns[0]] & changed[:, self.columns[1]]
         if not changed.any():
             return source
         if self.same_size:
-            return np.where(changed[..., None], self.target[start : start + size], source)
-
-        # ---- The fields of working size at these texels
-        row, column = self.grid.texels(size)
-        near = self.grid.row[start : start + size]
-
-        def smooth(values):
-            table = flat(mi.Float, self.grid.along_rows(values, start, size))
-            return self.grid.across(mi.Color3f, table, row, column)
-
-        def nearest(values):
-            table = flat(mi.Float, values[near].astype(np.float32))
-            return self.grid.nearest(mi.Color3f, table, row, column)
+            return np.where(changed[..., None], self.target[band.rows], source)
 
         # ---- Texels times m; where that is no moderate factor, replaced or added to
-        image = dr.unravel(mi.Color3f, flat(mi.Float, source))
-        composed = image * smooth(self.m)
+        grid = self.grid
+        near = grid.row[band.rows]
+        image = band.colours(source)
+        composed = image * grid.linear(mi.Color3f, band, self.m)
         if self.parts[max(near[0] - 1, 0) : near[-1] + 2].any():  # rows between which is interpolated
-            table = flat(mi.Float, self.grid.along_rows(self.parts, start, size))
-            replaced, added = self.grid.across(mi.Vector2f, table, row, column)
-            over = self.grid.beside(column)
+            replaced, added = grid.linear(mi.Vector2f, band, self.parts)
 
             def linear(field):
-                mean, slope = (flat(mi.Float, t) for t in field.along_rows(*places))
-                mean, slope = (self.grid.nearest(mi.Color3f, t, row, column) for t in (mean, slope))
-                return mean + slope * over
+                tables = field.along_rows((low, high), grid.place[band.rows])
+                mean, slope = (grid.nearest(mi.Color3f, band, flat(mi.Float, table)) for table in tables)
+                return mean + slope * grid.beside(band)
 
-            last = len(self.changed) - 1
-            places = [np.clip(r, 0, last) for r in (low, high)], self.grid.place[start : start + size]
             additions = (image + linear(self.more) - composed) * added
             replacements = (linear(self.replacement) - composed) * replaced
             composed = dr.maximum(composed + (additions + replacements), 0)
         if self.fixed:
-            composed = composed * nearest(self.fix[0]) + nearest(self.fix[1])
+            tables = (fix[near].astype(np.float32) for fix in self.fix)
+            factor, offset = (grid.nearest(mi.Color3f, band, flat(mi.Float, table)) for table in tables)
+            composed = composed * factor + offset
         composed = dr.select(flat(mi.Bool, changed), composed, image)
-        return as_image(composed, size, self.grid.shape[1]).numpy()
+        return band.image(composed).numpy()
 
 
 def _most_around(values):

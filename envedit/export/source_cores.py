@@ -8,7 +8,7 @@ import numpy as np
 
 from envedit.core.arrays import flat
 from envedit.core.rows import Rows
-from envedit.export.texel_maps import Places
+from envedit.export.texel_maps import Band, Places
 from envedit.representations.layers.layers import Layers
 from envedit.representations.layers.lights import Lights
 from envedit.representations.layers.separation import grown
@@ -31,7 +31,7 @@ class SourceCores:
             start, total = self.survey.rows
             rows, columns = self.survey.label.shape
             self.surveyed = Places(grid.shape, Rows(start, rows, total), columns)
-            self.inside = self.survey.label >= 0
+            self.labelled = self.survey.label >= 0
             self.label = grown(self.survey.label)
         theta = np.pi * np.arange(height) / max(height - 1, 1)
         sine = np.sin(theta)
@@ -40,40 +40,33 @@ class SourceCores:
         self._theta = [flat(mi.Float, t.astype(np.float32)) for t in (sine, np.cos(theta))]
         self._phi = [flat(mi.Float, f(phi).astype(np.float32)) for f in (np.sin, np.cos)]
 
-    def directions(self, start: int, row: mi.UInt32, column: mi.UInt32) -> mi.Vector3f:
-        """Return the unit vectors through the texels of a band that begins at row ``start``."""
-        first = dr.opaque(mi.UInt32, start)
-        sine, cosine = (dr.gather(mi.Float, t, row + first) for t in self._theta)
-        x, z = (dr.gather(mi.Float, t, column) for t in self._phi)
+    def directions(self, band: Band) -> mi.Vector3f:
+        """Return the unit vectors through the texels of a band."""
+        first = dr.opaque(mi.UInt32, band.start)
+        sine, cosine = (dr.gather(mi.Float, t, band.row + first) for t in self._theta)
+        x, z = (dr.gather(mi.Float, t, band.column) for t in self._phi)
         return mi.Vector3f(sine * x, cosine, -sine * z)
 
-    def follow(self, start: int, row: mi.UInt32) -> mi.Bool:
+    def follow(self, band: Band) -> mi.Bool:
         """Say which texels of a band are of rows that follow those above the horizon."""
-        return row + dr.opaque(mi.UInt32, start) >= self._follows
+        return band.row + dr.opaque(mi.UInt32, band.start) >= self._follows
 
-    def any(self, start: int, size: int) -> bool:
+    def any(self, band: Band) -> bool:
         """Say whether a band may have texels of a light."""
         if self.survey is None:
             return False
-        near = self.surveyed.row[[start, start + size - 1]]
+        near = self.surveyed.row[[band.start, band.stop - 1]]
         return bool((self.label[near[0] : near[1] + 1] >= 0).any())
 
-    def of(
-        self, image: mi.Color3f, row: mi.UInt32, column: mi.UInt32, d: mi.Vector3f, start: int, size: int
-    ) -> tuple[mi.Int32, mi.Float, mi.Color3f]:
-        """Return of texels at directions ``d``: light, or -1; how far inside it, 0 to 1; core in them."""
+    def of(self, band: Band, image: mi.Color3f, d: mi.Vector3f) -> tuple[mi.Int32, mi.Float, mi.Color3f]:
+        """Return of a band's texels at directions ``d``: light, or -1; how far inside it, 0 to 1; core."""
         at = self.surveyed
-        survey = self.survey
-        label = self.label[at.row[start : start + size]].astype(np.int32)
-        light = at.nearest(mi.Int32, flat(mi.Int32, label), row, column)
-        share = [
-            at.across(mi.Float, flat(mi.Float, at.inner(mask, start, size)), row, column, corners=True)
-            for mask in (self.inside, ~self.inside)
-        ]
-        table = flat(mi.Float, at.along_rows(survey.below, start, size))
-        below = at.across(mi.Color3f, table, row, column)
+        label = self.label[at.row[band.rows]].astype(np.int32)
+        light = at.nearest(mi.Int32, band, flat(mi.Int32, label))
+        inside, outside = (at.inside(band, mask) for mask in (self.labelled, ~self.labelled))
+        below = at.linear(mi.Color3f, band, self.survey.below)
         if self.lights.glowing:
             below *= self.lights.glow_before(d)
-        light = dr.select(self.follow(start, row), -1, light)
-        core = dr.select(light >= 0, dr.maximum(image - below, 0) * (1 - share[1]), 0)
-        return light, share[0], core
+        light = dr.select(self.follow(band), -1, light)
+        core = dr.select(light >= 0, dr.maximum(image - below, 0) * (1 - outside), 0)
+        return light, inside, core

@@ -22,6 +22,38 @@ BAND_TEXELS = 1 << 21
 """Texels of the source that are worked on at a time."""
 
 
+class Band:
+    """Some rows of a source, which are worked on at a time.
+
+    Attributes
+    ----------
+    rows : slice
+        Which they are, from ``start`` to ``stop``.
+    fresh : int
+        The first of them that is not in an earlier band.
+    row, column : UInt32
+        Of every texel, row after row; rows count from ``start``.
+    """
+
+    def __init__(self, start: int, stop: int, fresh: int, width: int):
+        self.start = start
+        self.stop = stop
+        self.fresh = fresh
+        self.rows = slice(start, stop)
+        self.shape = stop - start, width
+        index = dr.arange(mi.UInt32, self.shape[0] * width)
+        self.row = index // dr.opaque(mi.UInt32, width)
+        self.column = index - self.row * dr.opaque(mi.UInt32, width)
+
+    def colours(self, source: np.ndarray) -> mi.Color3f:
+        """Return the texels of the band's rows (size, W, 3), flat, as colours."""
+        return dr.unravel(mi.Color3f, flat(mi.Float, source))
+
+    def image(self, colour: mi.Color3f) -> mi.TensorXf:
+        """Arrange the texels of the band as a tensor (size, W, 3)."""
+        return mi.TensorXf(dr.ravel(colour), (*self.shape, 3))
+
+
 class Places:
     """Where the texels of a source lie among rows of a coarser map.
 
@@ -65,76 +97,67 @@ class Places:
         self._index = [dr.opaque(mi.UInt32(np.ascontiguousarray(i))) for i in index.T]
         self._part = [dr.opaque(mi.Float(np.ascontiguousarray(p))) for p in part.T]
 
-    def bands(self) -> Iterator[tuple[int, int, int]]:
-        """Yield (first row, first row not in an earlier band, rows): bands of one size over start to stop."""
+    def bands(self) -> Iterator[Band]:
+        """Yield bands of one size over start to stop."""
         height = self.stop - self.start
         size = min(max(BAND_TEXELS // self.shape[1], 1), height)
         for fresh in range(self.start, self.stop, max(size, 1)):
-            yield min(fresh, self.stop - size), fresh, size
+            start = min(fresh, self.stop - size)
+            yield Band(start, start + size, fresh, self.shape[1])
 
-    def along_rows(self, values: np.ndarray, start: int, size: int) -> np.ndarray:
-        """Interpolate values (rows, w, C) linearly at rows of the source; float32 (size, w, C)."""
-        return _between(values, np.clip(self.place[start : start + size], 0, self.count - 1))
+    def linear(self, kind: type[DrArray], band: Band, values: np.ndarray) -> DrArray:
+        """Interpolate values (rows, w, C) linearly at the texels of a band; ``kind`` has C components."""
+        place = np.clip(self.place[band.rows], 0, self.count - 1)
+        return self._across(kind, band, _between(values, place), self._index[:2], self._part[0])
 
-    def smooth_rows(self, values: np.ndarray, start: int, size: int, edge: int | None = None) -> np.ndarray:
-        """Interpolate values (rows, w, C) by cubic convolution at rows of the source; float32 (size, w, C).
+    def inside(self, band: Band, mask: np.ndarray) -> mi.Float:
+        """Interpolate a mask (rows, w) by its corners: 0 wherever a texel is not in it."""
+        around = np.pad(mask, ((1, 1), (0, 0)), mode="edge")
+        across = around & np.roll(around, 1, axis=1)
+        corners = across[:-1] & across[1:]
+        corners = np.concatenate([corners, corners[:, :1]], axis=1).astype(np.float64)
+        place = np.clip(self.place[band.rows] + 0.5, 0, self.count)
+        rows = _between(corners[..., None], place)
+        return self._across(mi.Float, band, rows, self._index[4:], self._part[1])
+
+    def _across(self, kind, band, rows, index, part):
+        """Interpolate along the columns values (size, columns, C) that are those of the band's rows."""
+        table = flat(mi.Float, rows)
+        first = band.row * dr.opaque(mi.UInt32, rows.shape[1])
+        a, b = (dr.gather(kind, table, first + dr.gather(mi.UInt32, side, band.column)) for side in index)
+        return a + (b - a) * dr.gather(mi.Float, part, band.column)
+
+    def smooth(self, band: Band, values: np.ndarray, edge: int | None = None) -> mi.Color3f:
+        """Interpolate values (rows, w, 3) by cubic convolution at the texels of a band.
 
         Nothing is interpolated across the edge before row ``edge`` of the values.
         """
-        place = self.place[start : start + size]
-        first, last = np.zeros(size, np.int64), np.full(size, self.count - 1)
+        # ---- Along the rows
+        place = self.place[band.rows]
+        first, last = 0, self.count - 1
         if edge is not None:
             above = place < edge - 0.5
             first, last = np.where(above, 0, edge), np.where(above, edge - 1, last)
         place = np.clip(place, first, last)
         top = np.floor(place).astype(np.int64)
-        a, b, before, after = (values[np.clip(top + step, first, last)] for step in (0, 1, -1, 2))
-        part = (place - top)[:, None, None]
-        return _keys(a, b, before, after, part).astype(np.float32)
+        around = (values[np.clip(top + step, first, last)] for step in (0, 1, -1, 2))
+        rows = _keys(*around, (place - top)[:, None, None]).astype(np.float32)
 
-    def inner(self, mask: np.ndarray, start: int, size: int) -> np.ndarray:
-        """Interpolate a mask (rows, w) by its corners, 0 wherever a texel is not in it; (size, w + 1)."""
-        around = np.pad(mask, ((1, 1), (0, 0)), mode="edge")
-        across = around & np.roll(around, 1, axis=1)
-        corners = across[:-1] & across[1:]
-        corners = np.concatenate([corners, corners[:, :1]], axis=1).astype(np.float64)
-        place = np.clip(self.place[start : start + size] + 0.5, 0, self.count)
-        return _between(corners[..., None], place)[..., 0]
+        # ---- Along the columns
+        table = flat(mi.Float, rows)
+        begin = band.row * dr.opaque(mi.UInt32, self.columns)
+        offsets = (dr.gather(mi.UInt32, index, band.column) for index in self._index[:4])
+        around = (dr.gather(mi.Color3f, table, begin + offset) for offset in offsets)
+        return _keys(*around, dr.gather(mi.Float, self._part[0], band.column))
 
-    def across(
-        self, kind: type[DrArray], table: DrArray, row: mi.UInt32, column: mi.UInt32, corners: bool = False
-    ) -> DrArray:
-        """Interpolate a table of :meth:`along_rows`, or of :meth:`inner`, at texels of a band."""
-        left, right = self._index[4:6] if corners else self._index[:2]
-        part = dr.gather(mi.Float, self._part[1 if corners else 0], column)
-        first = row * dr.opaque(mi.UInt32, self.columns + (1 if corners else 0))
-        a = dr.gather(kind, table, first + dr.gather(mi.UInt32, left, column))
-        b = dr.gather(kind, table, first + dr.gather(mi.UInt32, right, column))
-        return a + (b - a) * part
+    def nearest(self, kind: type[DrArray], band: Band, table: DrArray) -> DrArray:
+        """Look up a table (size, w), of the band's rows, at its texels."""
+        place = band.row * dr.opaque(mi.UInt32, self.columns)
+        return dr.gather(kind, table, place + dr.gather(mi.UInt32, self._index[4], band.column))
 
-    def smooth_across(
-        self, kind: type[DrArray], table: DrArray, row: mi.UInt32, column: mi.UInt32
-    ) -> DrArray:
-        """Interpolate a table of :meth:`smooth_rows` by cubic convolution at texels of a band."""
-        first = row * dr.opaque(mi.UInt32, self.columns)
-        around = [dr.gather(mi.UInt32, index, column) for index in self._index[:4]]
-        a, b, before, after = (dr.gather(kind, table, first + offset) for offset in around)
-        return _keys(a, b, before, after, dr.gather(mi.Float, self._part[0], column))
-
-    def nearest(self, kind: type[DrArray], table: DrArray, row: mi.UInt32, column: mi.UInt32) -> DrArray:
-        """Look up a table (size, w) at texels of a band."""
-        place = row * dr.opaque(mi.UInt32, self.columns) + dr.gather(mi.UInt32, self._index[4], column)
-        return dr.gather(kind, table, place)
-
-    def beside(self, column: mi.UInt32) -> mi.Float:
+    def beside(self, band: Band) -> mi.Float:
         """Columns from the nearest, -1/2 to 1/2."""
-        return dr.gather(mi.Float, self._part[1], column) - 0.5
-
-    def texels(self, size: int) -> tuple[mi.UInt32, mi.UInt32]:
-        """Row and column in the band of all its texels."""
-        index = dr.arange(mi.UInt32, size * self.shape[1])
-        row = index // dr.opaque(mi.UInt32, self.shape[1])
-        return row, index - row * dr.opaque(mi.UInt32, self.shape[1])
+        return dr.gather(mi.Float, self._part[1], band.column) - 0.5
 
 
 def _keys(a, b, before, after, part):
@@ -152,13 +175,3 @@ def _between(values, place):
     part = (place - top)[:, None, None]
     bottom = np.minimum(top + 1, len(values) - 1)
     return (values[top] + (values[bottom] - values[top]) * part).astype(np.float32)
-
-
-def as_colours(rows: np.ndarray) -> mi.Color3f:
-    """Return the texels of rows (n, W, 3), flat, as colours."""
-    return dr.unravel(mi.Color3f, flat(mi.Float, rows))
-
-
-def as_image(colour: mi.Color3f, size: int, width: int) -> mi.TensorXf:
-    """Arrange the texels of a band as a tensor (size, width, 3)."""
-    return mi.TensorXf(dr.ravel(colour), (size, width, 3))

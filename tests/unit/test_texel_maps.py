@@ -5,9 +5,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from envedit.core.arrays import flat
 from envedit.core.rows import Rows
-from envedit.export.texel_maps import Places, as_image
+from envedit.export.texel_maps import Places
 
 ROWS, COLUMNS = 24, 48
 
@@ -16,13 +15,9 @@ def interpolated(values, finer, edge=None, smooth=True):
     """Values (rows, w, 3) at the texels of a map that is finer by a factor."""
     shape = values.shape[0] * finer, values.shape[1] * finer
     grid = Places(shape, Rows(0, len(values), len(values)), values.shape[1])
-    row, column = grid.texels(shape[0])
-    if smooth:
-        table = flat(mi.Float, grid.smooth_rows(values, 0, shape[0], edge))
-        found = grid.smooth_across(mi.Color3f, table, row, column)
-    else:
-        found = grid.across(mi.Color3f, flat(mi.Float, grid.along_rows(values, 0, shape[0])), row, column)
-    return as_image(found, *shape).numpy(), grid
+    band = next(grid.bands())
+    found = grid.smooth(band, values, edge) if smooth else grid.linear(mi.Color3f, band, values)
+    return band.image(found).numpy(), grid
 
 
 def reflection(row, column, turns=0.0):

@@ -33,7 +33,7 @@ class _Points:
     """Points of one light, placed; ``omega`` is the solid angle of each."""
 
     light: int
-    places: tuple
+    places: tuple[mi.Float, mi.Float, mi.Float]
     flux: mi.Color3f
     omega: mi.Color3f
     half_row: float

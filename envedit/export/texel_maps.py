@@ -134,21 +134,21 @@ class Places:
         """
         # ---- Along the rows
         place = self.place[band.rows]
-        first, last = 0, self.count - 1
+        first, last = np.zeros(len(place), np.int64), np.full(len(place), self.count - 1)
         if edge is not None:
             above = place < edge - 0.5
             first, last = np.where(above, 0, edge), np.where(above, edge - 1, last)
         place = np.clip(place, first, last)
         top = np.floor(place).astype(np.int64)
-        around = (values[np.clip(top + step, first, last)] for step in (0, 1, -1, 2))
-        rows = _keys(*around, (place - top)[:, None, None]).astype(np.float32)
+        a, b, before, after = (values[np.clip(top + step, first, last)] for step in (0, 1, -1, 2))
+        rows = _keys(a, b, before, after, (place - top)[:, None, None]).astype(np.float32)
 
         # ---- Along the columns
         table = flat(mi.Float, rows)
         begin = band.row * dr.opaque(mi.UInt32, self.columns)
         offsets = (dr.gather(mi.UInt32, index, band.column) for index in self._index[:4])
-        around = (dr.gather(mi.Color3f, table, begin + offset) for offset in offsets)
-        return _keys(*around, dr.gather(mi.Float, self._part[0], band.column))
+        a, b, before, after = (dr.gather(mi.Color3f, table, begin + offset) for offset in offsets)
+        return _keys(a, b, before, after, dr.gather(mi.Float, self._part[0], band.column))
 
     def nearest(self, kind: type[DrArray], band: Band, table: DrArray) -> DrArray:
         """Look up a table (size, w), of the band's rows, at its texels."""

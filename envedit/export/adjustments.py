@@ -36,21 +36,9 @@ def adjust(
 ) -> tuple[np.ndarray, list[str]]:
     """Adjust a map: exposure and white balance, then its lights; NumericalError where it leaves float32.
 
-    Parameters
-    ----------
-    envmap : ndarray (H, W, 3) float32
-        Linear radiance that reaches the scene.
-    lights, output
-        How its lights are changed; its exposure, white balance and temperature.
-    scale : float
-        What the scene multiplies the map's file by; ``max_radiance`` is in the units of the file.
-
-    Returns
-    -------
-    adjusted : ndarray (H, W, 3) float32
-        The map itself where nothing is asked.
-    notes : list of str
-        What was done.
+    ``envmap`` (H, W, 3) float32 is linear radiance that reaches the scene, ``scale`` what the scene
+    multiplies the map's file by: ``max_radiance`` is in the units of the file. Returns the adjusted map, or
+    the map itself where nothing is asked, and what was done.
     """
     colour = output.white_balance or output.temperature
     if not (lights.max_radiance or lights.soften_degrees or output.exposure or colour):

@@ -53,10 +53,8 @@ def carry(
 
     Parameters
     ----------
-    representation : object
-        The representation of the working map's active rows, as it was edited.
-    params : dict
-        Its parameters.
+    representation, params
+        Of the working map's active rows, as edited.
     original_working, edited_working : ndarray (h, w, 3)
         The working map before and after; the first is the source resized. Of layers only
         their shape is used.
@@ -117,21 +115,7 @@ def carry(
 
 
 class _LayersAt:
-    """Layers at the resolution of a source, band by band: :func:`.compose` of fields that are interpolated.
-
-    Attributes
-    ----------
-    fields : TexelFields
-        Of the working map.
-    edge : int or None
-        Working row from which rows follow those above the horizon.
-    free : ndarray of bool (rows, w) or None
-        Working texels that gain and saturation act on; None: all.
-    relit : bool
-        The glow of a light has changed.
-    strength : Float
-        Of lights that stay, what their cores are multiplied by; of those that move, nothing is left.
-    """
+    """Layers at the resolution of a source, band by band: :func:`.compose` of interpolated fields."""
 
     def __init__(self, layers: Layers, params: dict, grid: Places):
         self.layers = layers
@@ -143,7 +127,7 @@ class _LayersAt:
             log_saturation = params["saturation"].numpy()[0, 0] * layers.scales["saturation"]
             self.log_saturation = dr.opaque(mi.Float, float(log_saturation))
 
-        # ---- Rows that follow those above the horizon
+        # ---- Working row from which rows follow those above the horizon; texels that are free; None: all
         self.edge = None
         self.free = layers.free
         if layers.below is not None:
@@ -151,7 +135,7 @@ class _LayersAt:
             if self.free is not None:
                 self.free = np.concatenate([self.free, np.ones(layers.below.shape, bool)])
 
-        # ---- Lights: which there are, which have moved, and what is left of the others' cores
+        # ---- Lights: whether a glow has changed, which have moved, and what the others' cores are times
         turn, flux, size = (value.numpy() for value in self.placed.values())
         own = layers.lights.own
         self._present = (flux > lights.DARK).any(axis=1)

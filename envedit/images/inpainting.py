@@ -30,18 +30,9 @@ class NothingAroundError(ValueError):
 def filled(envmap: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Return a map with a region replaced by what continues its surroundings.
 
-    Parameters
-    ----------
-    envmap : ndarray (H, W, 3) float32
-        Linear radiance, finite and not negative.
-    weight : ndarray (H, W)
-        How far a texel is replaced, 0 to 1.
-
-    Returns
-    -------
-    ndarray (H, W, 3) float32
-        Texels of weight 0 have the bits of ``envmap``. What is filled in is within the range of what is
-        :data:`RADIUS` pixels around the region, in each channel.
+    ``envmap`` (H, W, 3) float32 is linear radiance, finite and not negative; ``weight`` (H, W), 0 to 1, how
+    far a texel is replaced: texels of weight 0 keep their bits. What is filled in is within the range of what
+    is :data:`RADIUS` pixels around the region, in each channel.
 
     Raises
     ------

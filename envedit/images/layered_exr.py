@@ -22,24 +22,11 @@ def write(
 
     The layer ``edited``, or else the first, becomes the channels ``R``, ``G``, ``B``; any other NAME becomes
     ``NAME.R``, ``NAME.G``, ``NAME.B``, and one of two dimensions ``NAME.Y``. One part, marked as lat-long
-    with Rec.709 primaries.
+    with ``chromaticities``; None: Rec. 709.
 
-    Parameters
-    ----------
-    path : path-like
-        The file; an existing one is replaced.
-    layers : dict of str to ndarray (H, W, 3) or (H, W)
-        Linear radiance, or anything else with a value a texel; all of one size and finite in float32.
-        The first, or ``edited``, has three channels.
-    chromaticities : tuple, optional
-        Of the colours; None: Rec. 709.
-
-    Raises
-    ------
-    NumericalError
-        If a value is not finite in float32; names the layer and the first texel.
-    InputError
-        If the file cannot be written.
+    Layers (H, W, 3) or (H, W) are linear radiance, or anything else with a value a texel, all of one size;
+    the one that becomes R, G, B has three channels. NumericalError for a value that is not finite in float32
+    names the layer and the first texel; InputError if the file cannot be written.
     """
     name = os.fsdecode(path)
     default = DEFAULT if DEFAULT in layers else next(iter(layers))

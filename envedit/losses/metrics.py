@@ -211,8 +211,6 @@ def painted(
         The result's rendering, the painted picture and what it was painted on; linear radiance.
     coverage : array (h, w, 1)
         How much each pixel was painted.
-    tonemap : str
-        Of the display values.
     seen : ndarray of bool (h, w), optional
         Pixels that count; all by default.
     noise : ndarray (h, w), optional

@@ -76,20 +76,10 @@ class Adam:
         return leaves
 
     def step(self, grads: Mapping[str, Tensor], lr: float | None = None) -> bool:
-        """Update all parameters in one evaluation.
+        """Update all parameters in one evaluation, by a gradient for each, of its shape.
 
-        Parameters
-        ----------
-        grads : dict of str to tensor or array
-            One gradient for each parameter, of its shape.
-        lr : float, optional
-            Learning rate of this step.
-
-        Returns
-        -------
-        bool
-            True if the step was taken. False if a gradient is not finite or too large to square, or the step
-            leads to parameters or moments that are not finite: nothing has changed.
+        Returns whether the step was taken. It is not, and nothing has changed, if a gradient is not finite or
+        too large to square, or the step leads to parameters or moments that are not finite.
         """
         lr = self.lr if lr is None else lr
         (b1, b2) = self.betas

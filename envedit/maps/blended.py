@@ -34,19 +34,9 @@ class _Move:
 def blend(first: np.ndarray, second: np.ndarray, amount: float) -> tuple[np.ndarray, list[dict]]:
     """Blend two maps of one size.
 
-    Parameters
-    ----------
-    first, second : ndarray (H, W, 3) float32
-        Linear radiance in Rec. 709. Both are overwritten: two maps of 8192 x 4096 texels are 0.8 GB.
-    amount : float
-        0: the first; 1: the second, which is returned.
-
-    Returns
-    -------
-    blended : ndarray (H, W, 3) float32
-        It is ``first``, overwritten, where the amount is between.
-    lights : list of dict
-        ``direction`` and ``flux`` of each light of the result; empty where it is the second.
+    ``first`` and ``second`` (H, W, 3) float32 are linear radiance in Rec. 709. Both are overwritten: two maps
+    of 8192 x 4096 texels are 0.8 GB. At an ``amount`` of 1 the second is returned, below 1 the first,
+    overwritten; with it ``direction`` and ``flux`` of each light of the result, none where it is the second.
     """
     if amount >= 1:
         return second, []

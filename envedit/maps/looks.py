@@ -167,21 +167,10 @@ def lights_of(layers: Layers) -> dict[str, RoleLight]:
 
 
 def sky_change(before: np.ndarray, after: np.ndarray, weight: np.ndarray, total: int) -> tuple:
-    """Measure the gain, the saturation and the white balance between two skies.
+    """Measure the gain, the saturation and the white balance of :class:`Look` between two skies.
 
-    Parameters
-    ----------
-    before, after : ndarray (rows, W, 3)
-        Linear radiance of the first rows of a map, without its lights.
-    weight : ndarray (rows, W)
-        How much each texel counts.
-    total : int
-        Rows of the map.
-
-    Returns
-    -------
-    gain, saturation, white_balance
-        As of :class:`Look`.
+    ``before`` and ``after`` (rows, W, 3) are linear radiance of the first rows of a map of ``total`` rows,
+    without its lights; ``weight`` (rows, W) is how much each texel counts.
     """
     rows, columns = weight.shape
     weight = (weight / max(weight.sum(), 1e-300)).ravel()

@@ -121,15 +121,11 @@ def prepare_folder(
 ) -> None:
     """Move what an earlier run left in a folder to ``earlier-N`` in it.
 
-    InputError if an input lies where a result would go, or the folder cannot be used.
+    InputError if an input lies where a result would go, or the folder cannot be used. Of the results'
+    ``names`` the first, which says that a run is complete, is moved first, and the last is a checkpoint's.
 
     Parameters
     ----------
-    folder : Path
-        Where results will go.
-    names : sequence of str
-        Their names; the first, which says that a run is complete, is moved first, and the last is a
-        checkpoint's.
     inputs : sequence of path
         What the run reads, and must not be moved; looked at where the folder holds any result.
     keep : bool

@@ -129,12 +129,7 @@ class Backbone:
     def load(cls, kind: str, file: FilePath) -> Backbone:
         """Read the weights from a ``safetensors`` or ``npz`` file that holds torchvision's state dict.
 
-        Further tensors, such as those of the classifier, are ignored.
-
-        Raises
-        ------
-        InputError
-            If the file does not hold it; see :func:`envedit.losses.perceptual.weights.read`.
+        Further tensors, such as those of the classifier, are ignored; errors as of :func:`.weights.read`.
         """
         words, layers, model, original = KINDS[kind]
         shapes: dict[str, tuple[int, ...]] = {}
@@ -148,19 +143,9 @@ class Backbone:
         return next(n for n in range(1, 256) if self._sizes(n, pooling)[-1] > 0)
 
     def stack(self, height: int, width: int, pooling: str = "max") -> Stack:
-        """Lay the network out for images of one size.
+        """Lay the network out for images of one size; InputError if nothing would be left of them.
 
-        Parameters
-        ----------
-        height, width : int
-            Size of the images.
-        pooling : str
-            "max", or "hanning" for the L2 pooling of DISTS in place of every max pooling.
-
-        Raises
-        ------
-        InputError
-            If nothing would be left of images as small as these.
+        ``pooling`` is "max", or "hanning" for the L2 pooling of DISTS in place of every max pooling.
         """
         rows, columns = self._sizes(height, pooling), self._sizes(width, pooling)
         if min(rows[-1], columns[-1]) < 1:
@@ -239,17 +224,9 @@ class Stack:
             self._steps.append(step)
 
     def forward(self, x: DrArray) -> list:
-        """Evaluate all layers.
+        """Return the image and the output of every layer: what :meth:`taps` and :meth:`backward` need.
 
-        Parameters
-        ----------
-        x : Float
-            Image, H * W * 3 numbers, normalised as the network requires; not differentiated.
-
-        Returns
-        -------
-        list
-            The image and the output of every layer: what :meth:`taps` and :meth:`backward` need.
+        ``x`` has H * W * 3 numbers, normalised as the network requires; it is not differentiated.
         """
         tape = [x]
         for step in self._steps:
@@ -261,19 +238,9 @@ class Stack:
         return [(tape[i], pixels, channels) for i, pixels, channels in self._tapped]
 
     def backward(self, tape: list, gradients: list) -> DrArray:
-        """Pull gradients of the taps back to the image.
+        """Pull gradients, N * C numbers for each tap, back to the image: H * W * 3 numbers.
 
-        Parameters
-        ----------
-        tape : list
-            What :meth:`forward` returned.
-        gradients : list
-            One for each tap, N * C numbers.
-
-        Returns
-        -------
-        Float
-            Gradient with respect to the image, H * W * 3 numbers.
+        ``tape`` is what :meth:`forward` returned.
         """
         at = {i: gradient for (i, _, _), gradient in zip(self._tapped, gradients, strict=True)}
         gradient: DrArray = None

@@ -168,21 +168,12 @@ def matched(
 
     Of all ways to pair them, the one with the least sum of angle + abs(ln(flux ratio)) (radians; fluxes are
     means over channels), where a light of ``before`` that is left without another costs :data:`FARTHEST`. Not
-    of squares, so that few lights have changed much rather than many a little.
+    of squares, so that few lights have changed much rather than many a little. Angles are to where
+    ``rotation`` (3, 3), of the whole map between them, brings a light.
 
-    Parameters
-    ----------
-    before, after : list of dict
-        Of :func:`listed`.
-    rotation : ndarray (3, 3), optional
-        Of the whole map between them: angles are to where that brings a light.
-
-    Returns
-    -------
-    dict
-        The lists ``before`` and ``after``. A light has the same ``id`` in both, from 1; ``before`` has
-        ``removed``, whether it is gone, and ``after`` has ``added``, whether it is new, and ``moved_degrees``
-        from where it was before any rotation, None if it is new.
+    Returns the lists ``before`` and ``after``, of :func:`listed`, with the same ``id`` for a light in both,
+    from 1. ``before`` has ``removed``, whether it is gone, and ``after`` has ``added``, whether it is new,
+    and ``moved_degrees`` from where it was before any rotation, None if it is new.
     """
     # ---- Pair lights that are near to each other and of similar flux
     start, end = (

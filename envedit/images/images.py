@@ -293,8 +293,6 @@ def write_exr(
 
     Parameters
     ----------
-    path : path-like
-        The file; an existing one is replaced.
     image : array (H, W, 3)
         Linear radiance, finite in float32; as half, at most :data:`.radiance.HALF_MAX`.
     metadata : dict, optional
@@ -311,9 +309,9 @@ def write_exr(
     Raises
     ------
     NumericalError
-        If a value is not finite in the file; names the first texel.
+        A value is not finite in the file; names the first texel.
     InputError
-        If the file cannot be written.
+        The file cannot be written.
     """
     name = os.fsdecode(path)
     pixels = _checked(name, image)

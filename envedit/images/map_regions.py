@@ -34,16 +34,9 @@ def changed(envmap: np.ndarray, regions: Sequence[Region]) -> np.ndarray:
     """Return a map (H, W, 3), linear radiance, in which regions are scaled and filled, in their order.
 
     Radiance becomes 1 + w (factor - 1) times itself, or (1 - w) times itself and w times what is filled in
-    (:func:`.inpainting.filled`).
-
-    Raises
-    ------
-    ConfigError
-        A region that is to be filled covers the whole map.
-    InputError
-        A texel becomes brighter than :data:`.radiance.BRIGHTEST`.
-    MachineError
-        One is to be filled, and OpenCV is not installed.
+    (:func:`.inpainting.filled`). ConfigError if a region that is to be filled covers the whole map,
+    InputError if a texel becomes brighter than :data:`.radiance.BRIGHTEST`, MachineError if one is to be
+    filled and OpenCV is not installed.
     """
     height, width, _ = envmap.shape
     for i, region in enumerate(regions):

@@ -29,19 +29,9 @@ _GAMMA_TOLERANCE = 0.02  # programs write 0.45455 for sRGB, rounded to 0.45 by s
 def honour(pixels: np.ndarray, info: Info, space: str = AUTO) -> np.ndarray:
     """Return the pixels (H, W, C) of a file upright, codes under the sRGB curve; note the rest in ``info``.
 
-    Parameters
-    ----------
-    pixels : ndarray (H, W, C)
-        As decoded: float32, or uint8 or uint16 codes.
-    info : dict
-        Of the decoder; ``marks`` is taken out, ``chromaticities`` set and ``warnings`` extended.
-    space : str
-        A name of :data:`.primaries.SPACES` that goes before what the file says, or "auto".
-
-    Raises
-    ------
-    InputError
-        The file's colour space is not known.
+    Pixels are float32, or uint8 or uint16 codes. Of the decoder's ``info`` ``marks`` is taken out,
+    ``chromaticities`` set and ``warnings`` extended. ``space`` is a name of :data:`.primaries.SPACES` that
+    goes before what the file says, or "auto". InputError if the file's colour space is not known.
     """
     marks = info.pop("marks")
     warnings = info["warnings"]

@@ -68,19 +68,9 @@ class Change:
 def apply(envmap: np.ndarray, look: Look, amount: float = 1.0, start: Look | None = None) -> np.ndarray:
     """Return a map in the light of a look.
 
-    Parameters
-    ----------
-    envmap : ndarray (H, W, 3) float32
-        Linear radiance, finite and not negative.
-    look, start : Look
-        What is done at amount 1, and at amount 0; without the latter that is nothing.
-    amount : float
-        Between 0 and 1 lights move on great circles, fluxes and gains change in proportion.
-
-    Raises
-    ------
-    NumericalError
-        The map leaves single precision.
+    ``envmap`` (H, W, 3) float32 is linear radiance, finite and not negative. At an ``amount`` of 1 all of
+    ``look`` is done, at 0 ``start``, or nothing; between, lights move on great circles, fluxes and gains
+    change in proportion. NumericalError if the map leaves single precision.
     """
     if amount == 0 and start is None:
         return envmap

@@ -59,22 +59,10 @@ def output_path(
     >>> output_path(None, "adjusted", ["skies/sky.hdr"])
     PosixPath('sky_adjusted.hdr')
 
-    Parameters
-    ----------
-    requested : path-like, optional
-        The file, .exr or .hdr; None: named after the first source, of its format (PNG and JPEG: .exr), with
-        a number if there is one already.
-    word : str
-        What has been done.
-    sources : sequence of path-like
-        The files that are read; none of them is ever the result.
-    overwrite : bool
-        Whether a requested file may be replaced.
-
-    Raises
-    ------
-    ConfigError
-        The file is a source, or exists already, or ends otherwise.
+    ``sources`` are the files that are read, ``word`` says what has been done to them. A file that is not
+    requested has the format of the first source (PNG and JPEG: .exr), and a number if there is one already.
+    ConfigError if a requested one is a source, does not end in .exr or .hdr, or exists already and may not be
+    replaced.
     """
     names = [os.fsdecode(source) for source in sources]
     if requested is None:
@@ -99,24 +87,10 @@ def output_path(
 def write(path: FilePath, values: np.ndarray, like: InputMap | None = None) -> list[str]:
     """Write a map, by the ending of its name as OpenEXR or Radiance; returns warnings: what half cannot hold.
 
-    Parameters
-    ----------
-    path : path-like
-        Of :func:`output_path`.
-    values : ndarray (H, W, 3)
-        Linear values in the colours of ``like``.
-    like : InputMap, optional
-        The map that was read: OpenEXR is half where its file is, and its chromaticities are those of the
-        result. None: float, Rec. 709.
-
-    Raises
-    ------
-    ConfigError
-        The path is that of ``like``.
-    NumericalError
-        A value is not finite.
-    InputError
-        The file cannot be written.
+    ``values`` (H, W, 3) are linear, in the colours of ``like``, the map that was read: OpenEXR is half where
+    its file is, and its chromaticities are those of the result. None: float, Rec. 709. ConfigError if the
+    path is that of ``like``, NumericalError if a value is not finite, InputError if the file cannot be
+    written.
     """
     path = Path(os.fsdecode(path))
     if like is not None and os.path.realpath(path) == os.path.realpath(like.source):

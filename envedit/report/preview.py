@@ -104,21 +104,16 @@ def sheet(
 ) -> bytes:
     """Draw a row of renderings and under each its environment map, each row at the exposure of `stops_of`.
 
+    Returns a PNG file, whose text ``Description`` names the columns and the exposures.
+
     Parameters
     ----------
     renders, maps : dict of str to array or None
         Linear radiance, ``(H, W, 3)``, in the order of the columns, usually ``initial``, ``target``,
         ``edited``. A map stands under the rendering of the same name; one that is missing or None (the true
         map is not always known) leaves a grey rectangle. Maps are drawn 2:1.
-    tonemap : str
-        A name of `envedit.core.color.TONEMAPS`.
     views : sequence of slice
         Rows of each view, where renderings are of several: they are drawn below each other.
-
-    Returns
-    -------
-    bytes
-        A PNG file, whose text ``Description`` names the columns and the exposures.
     """
     names = list(dict.fromkeys([*renders, *maps]))
     renders = known(renders)
@@ -130,7 +125,8 @@ def sheet(
     widest = max((image.shape[1] for image in renders.values()), default=512)
     width = min(widest * max(1, round(320 / widest)), 768)
     parts = views or (slice(None),)
-    heights = [_height(image[rows], width) for image in [*renders.values()][:1] for rows in parts]
+    sizes = [image[rows].shape for image in [*renders.values()][:1] for rows in parts]
+    heights = [min(max(round(width * size[0] / size[1]), 1), 4 * width) for size in sizes]
     columns = []
     for name in names:
         tiles = [np.full((height, width, 3), UNKNOWN, np.uint8) for height in heights]
@@ -149,11 +145,6 @@ def sheet(
 def _framed(pixels, width):
     """Add a frame on top and left, and at bottom and right, of the given widths."""
     return np.pad(pixels, (width, width, (0, 0)), constant_values=BACKGROUND)
-
-
-def _height(image, width):
-    """Height at which a rendering is drawn, of at most four times its width."""
-    return min(max(round(width * image.shape[0] / image.shape[1]), 1), 4 * width)
 
 
 # ----------------------------------------------------------------------------------------------------------

@@ -99,17 +99,15 @@ class MovedLights:
         radius = float(lights.size_factor(self.size[light, 0])) * math.radians(lights.LOBE_DEGREES)
         radius = math.hypot(radius, NARROWEST * np.pi / max(self.height - 1, 1))
 
-        # ---- its sum over the texels, by chord^2 = 4 sin^2(dtheta / 2) + 4 sin sin sin^2(dphi / 2)
-        polar = np.pi * np.arange(self.height) / max(self.height - 1, 1)
-        azimuth = 2 * np.pi * (np.arange(self.width) + 0.5) / self.width
-        across = math.hypot(centre[0], centre[2])
-        away = polar - math.atan2(across, centre[1])
-        around = np.square(np.sin((azimuth - math.atan2(centre[0], -centre[2])) / 2))
+        # ---- Its sum over the texels
         omega = latlong.lookup_solid_angles(self.height, self.width)
+        middle, _ = latlong.texel_position(centre, self.height, self.width)
+        reach = REACH * radius / np.pi * self.height
         total = 0.0
-        for row in np.flatnonzero(np.abs(away) < REACH * radius):
-            chord = 2 * np.sqrt(np.sin(away[row] / 2) ** 2 + np.sin(polar[row]) * across * around)
-            total += omega[row] * float(_lobe(chord / radius, np).sum())
+        for row in range(max(int(middle - reach), 0), min(int(middle + reach) + 2, self.height)):
+            d = latlong.directions(self.height, self.width, slice(row, row + 1))
+            angle = np.linalg.norm(d - centre, axis=-1) / radius
+            total += omega[row] * float(_lobe(angle, np).sum())
 
         flux = own.flux[light] * lights.flux_factor(self.flux[light])
         self.lobes.append((_opaque(mi.Vector3f, centre), radius, _opaque(mi.Color3f, flux / total)))

@@ -166,12 +166,7 @@ def _shaped(kind, flat, shape):
 def cosine(lr: float, step: int, total: int) -> float:
     """Anneal from ``lr`` at step 0 to 0 at step ``total``, and stay there (CosineAnnealingLR).
 
-    ``lr (1 + cos(pi step / total)) / 2``. With ``lr=1, total=4``:
-
-    ======  ====  ======  ====  ======  ====  ====
-    step    0     1       2     3       4     5
-    rate    1     0.854   0.5   0.146   0     0
-    ======  ====  ======  ====  ======  ====  ====
+    ``lr (1 + cos(pi step / total)) / 2``.
     """
     return lr * 0.5 * (1 + math.cos(math.pi * min(step / total, 1.0)))
 
@@ -180,12 +175,7 @@ def cosine_warm_restarts(lr: float, step: int, period: int) -> float:
     """Anneal from ``lr`` towards 0 again and again, every ``period`` steps.
 
     Loshchilov and Hutter 2017, Eq. 5, with T_mult = 1 and a minimum of 0: PyTorch's
-    CosineAnnealingWarmRestarts. With ``lr=1, period=4``:
-
-    ======  ====  ======  ====  ======  ====  ======
-    step    0     1       2     3       4     5
-    rate    1     0.854   0.5   0.146   1     0.854
-    ======  ====  ======  ====  ======  ====  ======
+    CosineAnnealingWarmRestarts.
     """
     return cosine(lr, step % period, period)
 
@@ -194,12 +184,6 @@ def ramp(start: float, end: float, step: float, total: int) -> float:
     """Walk geometrically from ``start`` at step 0 to ``end`` at step ``total - 1``, and stay there.
 
     ``start (end / start)^(step / (total - 1))``; a run of one step stays at ``start``.
-    With ``start=1, end=1e4, total=5``:
-
-    ======  ====  ====  =====  ======  =======  =======
-    step    0     1     2      3       4        5
-    value   1     10    100    1000    10000    10000
-    ======  ====  ====  =====  ======  =======  =======
     """
     if start == end:
         return start

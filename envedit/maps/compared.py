@@ -9,7 +9,7 @@ from envedit.core import latlong
 from envedit.core.color import luminance
 from envedit.export import light_list
 from envedit.losses import metrics
-from envedit.losses.perceptual import distances, installed
+from envedit.losses.perceptual import installed
 from envedit.maps import map_lights
 from envedit.representations.layers import file_lights
 
@@ -35,7 +35,7 @@ def pictures(first: np.ndarray, second: np.ndarray) -> dict:
         None without trained weights; ``width``; ``irradiance``: by axis, luminance ``first`` and ``second``,
         and ``stops``, log2 of the second over the first ("+y" is the horizontal plane).
     """
-    measured = metrics.compare(second, first, lpips=_lpips())
+    measured = metrics.compare(second, first, lpips=installed.load(config.Config()).lpips)
     return measured | {"width": first.shape[1], "irradiance": _irradiance(first, second)}
 
 
@@ -66,13 +66,3 @@ def lights(first: np.ndarray, second: np.ndarray) -> dict:
         own = float(luminance(light["flux"]))
         light["stops_of_flux"] = map_lights.stops(own, flux.get(light["id"], 0.0))
     return matched
-
-
-def _lpips():
-    """Load LPIPS where its weights are; None elsewhere."""
-    settings = config.Config()
-    files = installed.files(settings)
-    if "backbone" not in files:
-        return None
-    network = settings.perceptual.network
-    return distances.Lpips(network, files["backbone"], files["heads"])

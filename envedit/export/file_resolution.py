@@ -69,7 +69,9 @@ def carried(
     Returns the map with its lights placed and its regions changed, and its edit (H, W, 3), radiance before
     adjustments.
     """
-    settings = _kept_lights_locked(settings, input_map)
+    if input_map.placed is not None:  # lights that stand in regions that are kept are locked
+        kept = map_regions.kept(settings.regions, *input_map.placed.envmap.shape[:2])
+        settings = replace(settings, lights=input_map.placed.locking(settings.lights, kept))
     full = _by_hand(settings, input_map, own)
     before = latlong.rotate(initial, solution.turn_degrees)
     source = latlong.rotate(full.radiance, solution.turn_degrees)
@@ -97,27 +99,16 @@ def carried(
     return full, edited
 
 
-def _kept_lights_locked(settings, input_map):
-    """Lock the lights that stand in regions that are kept."""
-    if input_map.placed is None:
-        return settings
-    placed = input_map.placed
-    kept = map_regions.kept(settings.regions, *placed.envmap.shape[:2])
-    return replace(settings, lights=placed.locking(settings.lights, kept))
-
-
 def _by_hand(settings: config.Input, input_map: inputs.InputMap, own: inputs.InputMap) -> inputs.InputMap:
     """Place lights, change regions, and rotate the map as the file has it, as at working size."""
     full = own
     if input_map.placed is not None:
         placed = input_map.placed
-        before = placed.envmap
-        rows = Rows.of(len(placed.envmap))
         moved = full.radiance
         if any("light" in light for light in settings.lights):
-            moved = full_resolution.carry(
-                placed.layers, placed.params(settings.lights), before, before, moved, rows
-            )
+            params = placed.params(settings.lights)
+            rows = Rows.of(len(placed.envmap))
+            moved = full_resolution.carry(placed.layers, params, placed.envmap, placed.envmap, moved, rows)
         moved = placed_lights.add(moved, [light for light in settings.lights if "light" not in light])
         full = replace(full, stored=full.as_stored(moved))
     if settings.regions:

@@ -11,7 +11,10 @@ from __future__ import annotations
 import os
 import stat
 
-from envedit.core.errors import EnveditError, InputError
+import numpy as np
+
+from envedit.core.errors import EnveditError, InputError, NumericalError, place_of
+from envedit.core.types import ArrayLike
 
 MAX_SIDE = 32768
 MAX_TEXELS = 2**27
@@ -61,3 +64,16 @@ def shown(text: str, most: int = 60) -> str:
     """Return text of a file for a message: cut to ``most`` characters, without control codes."""
     text = text[:most]
     return text if text.isprintable() else ascii(text)[1:-1][:most]
+
+
+def finite(name: str, values: ArrayLike, what: str = "texels") -> np.ndarray:
+    """Return an image (H, W, C) or (H, W) as float32, to be written; NumericalError if it is not finite."""
+    with np.errstate(over="ignore"):  # caught below, as an infinity
+        values = np.asarray(values).astype(np.float32, copy=False)
+    bad = ~np.isfinite(values)
+    if bad.any():
+        texels = bad.reshape(*bad.shape[:2], -1).any(axis=2)
+        first = ", ".join(f"{value:g}" for value in np.atleast_1d(values[texels][0]))
+        where = f"the first at {place_of(bad)} ({first})"
+        raise NumericalError(f"{name}: not written: {texels.sum()} {what} are not finite, {where}")
+    return values

@@ -14,10 +14,10 @@ import numpy as np
 
 from envedit.core import latlong, primaries, radiance
 from envedit.core.atomic_files import write_atomically
-from envedit.core.errors import ConfigError, EnveditError, InputError, NumericalError, place_of
+from envedit.core.errors import ConfigError, EnveditError, InputError, place_of
 from envedit.core.types import ArrayLike, FilePath, Info
 from envedit.images import exr, ldr, marks, rgbe, tiff
-from envedit.images.headers import MAX_SIDE, damaged, head_of
+from envedit.images.headers import MAX_SIDE, damaged, finite, head_of
 
 FORMATS = (
     ("exr", b"\x76\x2f\x31\x01", exr.read),
@@ -377,12 +377,4 @@ def _checked(name, image):
     image = np.asarray(image)
     if image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
         raise ValueError(f"{name}: an image to write is (H, W, 3), got shape {image.shape}")
-    with np.errstate(over="ignore"):  # caught below, as an infinity
-        image = image.astype(np.float32)
-    bad = radiance.any_channel(~np.isfinite(image))
-    if bad.any():
-        values = ", ".join(f"{v:g}" for v in image[bad][0])
-        raise NumericalError(
-            f"{name}: not written: {bad.sum()} texels are not finite, the first at {place_of(bad)} ({values})"
-        )
-    return image
+    return finite(name, image)

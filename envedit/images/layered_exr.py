@@ -6,10 +6,10 @@ import os
 
 import numpy as np
 
-from envedit.core.errors import NumericalError, place_of
 from envedit.core.primaries import Chromaticities
 from envedit.core.types import FilePath
 from envedit.images import exr
+from envedit.images.headers import finite
 
 DEFAULT = "edited"
 """The layer that is written as plain R, G, B: what a program shows that knows of no layers."""
@@ -39,21 +39,8 @@ def write(
             raise ValueError(
                 f"{name}: layer '{layer}' has shape {values.shape}, expected {size} with 3 channels"
             )
-        values = _finite(name, layer, values)
+        values = finite(name, values, f"texels of layer '{layer}'")
         prefix = "" if layer == default else f"{layer}."
         for i, channel in enumerate("RGB" if colour else "Y"):
             planes[prefix + channel] = values[..., i] if colour else values
     exr.write(name, planes, chromaticities)
-
-
-def _finite(name, layer, values):
-    with np.errstate(over="ignore"):  # caught below, as an infinity
-        values = values.astype(np.float32, copy=False)
-    bad = ~np.isfinite(values)
-    if bad.any():
-        count = (bad if bad.ndim == 2 else bad.any(axis=2)).sum()
-        raise NumericalError(
-            f"{name}: not written: {count} texels of layer '{layer}' are not finite, "
-            f"the first at {place_of(bad)}"
-        )
-    return values

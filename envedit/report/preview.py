@@ -125,8 +125,8 @@ def sheet(
     widest = max((image.shape[1] for image in renders.values()), default=512)
     width = min(widest * max(1, round(320 / widest)), 768)
     parts = views or (slice(None),)
-    sizes = [image[rows].shape for image in [*renders.values()][:1] for rows in parts]
-    heights = [min(max(round(width * size[0] / size[1]), 1), 4 * width) for size in sizes]
+    shapes = [image[rows].shape for image in [*renders.values()][:1] for rows in parts]
+    heights = [min(max(round(width * shape[0] / shape[1]), 1), 4 * width) for shape in shapes]
     columns = []
     for name in names:
         tiles = [np.full((height, width, 3), UNKNOWN, np.uint8) for height in heights]

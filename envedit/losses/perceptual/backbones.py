@@ -121,7 +121,7 @@ class Backbone:
         self.title = KINDS[kind][0]
         self.layers = KINDS[kind][1]()
         self.channels = [layer.outputs for layer in self.layers if isinstance(layer, Conv) and layer.tap]
-        self._weights = [
+        self.weights: list[Any] = [
             _as_matrix(layer, tensors) if isinstance(layer, Conv) else None for layer in self.layers
         ]
 
@@ -154,7 +154,7 @@ class Backbone:
                 f"image of {height} rows and {width} columns: too small for {self.title}; "
                 f"it needs {least} of each."
             )
-        return Stack(self.layers, self._weights, rows, columns, pooling)
+        return Stack(self, list(zip(rows, columns, strict=True)), pooling)
 
     def _sizes(self, n, pooling):
         """Sizes along one side: of the image, and after every layer; 0 from where nothing is left."""
@@ -195,23 +195,16 @@ class Stack:
     Gradients are pulled back through the network of DISTS: VGG16 with "hanning".
     """
 
-    def __init__(
-        self,
-        layers: Sequence[Conv | Pool],
-        matrices: Sequence[Any],
-        rows: Sequence[int],
-        columns: Sequence[int],
-        pooling: str,
-    ):
+    def __init__(self, backbone: Backbone, sizes: Sequence[tuple[int, int]], pooling: str):
         self._steps: list[Any] = []
         self._tapped: list[tuple[int, int, int]] = []
         channels = 3
         step: Any
-        for i, layer in enumerate(layers):
-            before, after = (rows[i], columns[i], channels), (rows[i + 1], columns[i + 1])
+        for i, layer in enumerate(backbone.layers):
+            before, after = (*sizes[i], channels), sizes[i + 1]
             if isinstance(layer, Conv):
                 channels = layer.outputs
-                matrix, bias = matrices[i]
+                matrix, bias = backbone.weights[i]
                 step = convolution.Convolution(
                     matrix, bias, before, (*after, channels), layer.kernel, layer.stride, layer.padding
                 )

@@ -13,7 +13,7 @@ texels of a map at any resolution have the weights of their own directions.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -42,11 +42,8 @@ def changed(envmap: np.ndarray, regions: Sequence[Region]) -> np.ndarray:
     for i, region in enumerate(regions):
         if region["action"] == "keep":
             continue
-        envmap = envmap.copy()
+        weight = _weight(region, height, width)
         if region["action"] == "fill":
-            weight = np.zeros((height, width), np.float32)
-            for band, part in _weights(region, height, width):
-                weight[band] = part
             try:
                 envmap = inpainting.filled(envmap, weight)
             except inpainting.NothingAroundError:
@@ -55,9 +52,10 @@ def changed(envmap: np.ndarray, regions: Sequence[Region]) -> np.ndarray:
                     "make it smaller"
                 ) from None
             continue
-        for band, part in _weights(region, height, width):
+        envmap = envmap.copy()
+        for row in np.flatnonzero(weight.any(axis=1)):
             with np.errstate(over="ignore"):
-                envmap[band] *= 1 + part[..., None] * np.float32(np.array(region["factor"]) - 1)
+                envmap[row] *= 1 + weight[row][:, None] * np.float32(np.array(region["factor"]) - 1)
         require_radiance(envmap, f"input.regions[{i}]", brightest=BRIGHTEST)
     return envmap
 
@@ -69,8 +67,7 @@ def kept(regions: Sequence[Region], height: int, width: int) -> np.ndarray | Non
         return None
     free = np.ones((height, width), np.float32)
     for region in keeping:
-        for band, part in _weights(region, height, width):
-            free[band] *= 1 - part
+        free *= 1 - _weight(region, height, width)
     return 1 - free
 
 
@@ -83,8 +80,9 @@ def blended(edited: np.ndarray, original: np.ndarray, keep: np.ndarray) -> np.nd
     return mixed
 
 
-def _weights(region: Region, height: int, width: int) -> Iterator[tuple[slice, np.ndarray]]:
-    """Yield bands of rows, and the weights (rows, W) float32 in them."""
+def _weight(region: Region, height: int, width: int) -> np.ndarray:
+    """Return the weight of a region in every texel, (H, W) float32."""
+    weight = np.empty((height, width), np.float32)
     texel = np.degrees(max(np.pi / max(height - 1, 1), 2 * np.pi / width))
     fade = max(region["softness"], texel)
     for first in range(0, height, ROWS):
@@ -94,7 +92,8 @@ def _weights(region: Region, height: int, width: int) -> Iterator[tuple[slice, n
         else:
             inwards = _within_polygon(region["polygon"], (height, width), band)
         t = np.clip(1 + inwards / fade, 0, 1)
-        yield band, (t * t * (3 - 2 * t)).astype(np.float32)
+        weight[band] = t * t * (3 - 2 * t)
+    return weight
 
 
 # ---- Shapes ------------------------------------------------------------------------------------------------

@@ -24,14 +24,9 @@ patches that two of those skies have. Towards a rendering another sky can be mea
 
 
 def natural(edited: np.ndarray, original: np.ndarray, true: np.ndarray | None = None) -> dict:
-    """Compare an edited map with the original, and with the true map where that is known.
+    """Compare an edited map with the original, and with the true map, which makes the target, where known.
 
-    Parameters
-    ----------
-    edited, original : ndarray (H, W, 3)
-        Whole maps, linear radiance.
-    true : ndarray (H, W, 3), optional
-        The map that makes the target.
+    They are whole maps (H, W, 3), linear radiance.
 
     Returns
     -------

@@ -111,17 +111,18 @@ class Ssim:
 
     def _normalised(self, weight):
         """Crop the weights to the window centres and let them sum to one (or all be zero)."""
-        values = expand(weight, self.shape)
-        crop = self._row_start(len(self._columns) // 2) + len(self._rows) // 2 * self.shape[1] * self.shape[2]
-        values = dr.gather(type(values), values, crop)
+        top, left = len(self._rows) // 2, len(self._columns) // 2
+        height, width, _ = self.map_shape
+        values = type(weight)(expand(weight, self.shape), self.shape)
+        values = values[top : top + height, left : left + width].array
         mass = total(values)
         return dr.select(mass > 0, values / type(values)(mass), 0)
 
-    def _row_start(self, shift=0):
+    def _row_start(self):
         """Index, in an array with full-length rows, of each window's first column."""
         height, width, channels = self.map_shape
         index = dr.arange(dr.uint32_array_t(type(self._y)), height * width * channels)
-        return index + index // (width * channels) * ((self.shape[1] - width) * channels) + shift * channels
+        return index + index // (width * channels) * ((self.shape[1] - width) * channels)
 
     def _moments(self, *fields):
         """Filter along columns: mean and variance of each field."""

@@ -14,6 +14,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from envedit.config.toml import quote
+from envedit.core.rotations import rotation_matrix, rotation_vector
 
 DEFAULT_VARIANT, LIGHTS_VARIANT = "map", "sky_and_lights"
 """The two variants of the set ``lighting``: the whole map; the map without its lights, and these as lamps."""
@@ -104,12 +105,13 @@ def _dome(file, rotation, scale):
 def _distant(number, light):
     flux = np.asarray(light["flux"], np.float64)
     intensity = flux.max()
+    facing = rotation_matrix(rotation_vector(np.array([0.0, 0.0, 1.0]), np.array(light["direction"])))
     return _prim(
         f'DistantLight "Light_{number}"',
         f"float inputs:angle = {light['angle']:.9g}",
         "bool inputs:normalize = 1",
         *_brightness(intensity, flux / intensity if intensity > 0 else np.ones(3)),
-        *_placed(_facing(np.asarray(light["direction"], np.float64))),
+        *_placed(facing),
     )
 
 
@@ -130,14 +132,6 @@ def _placed(rotation):
         f"matrix4d xformOp:transform = ( {matrix}, (0, 0, 0, 1) )",
         'uniform token[] xformOpOrder = ["xformOp:transform"]',
     )
-
-
-def _facing(direction):
-    """Return a rotation (3, 3) that takes +Z to a unit vector: the light then shines from there."""
-    helper = np.eye(3)[np.argmin(np.abs(direction))]
-    across = np.cross(helper, direction)
-    across /= np.linalg.norm(across)
-    return np.stack([across, np.cross(direction, across), direction], axis=1)
 
 
 def _prim(name, *lines):

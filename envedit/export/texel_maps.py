@@ -23,24 +23,15 @@ BAND_TEXELS = 1 << 21
 
 
 class Band:
-    """Some rows of a source, which are worked on at a time.
-
-    Attributes
-    ----------
-    rows : slice
-        Which they are, from ``start`` to ``stop``.
-    fresh : int
-        The first of them that is not in an earlier band.
-    row, column : UInt32
-        Of every texel, row after row; rows count from ``start``.
-    """
+    """Some rows of a source, which are worked on at a time."""
 
     def __init__(self, start: int, stop: int, fresh: int, width: int):
         self.start = start
         self.stop = stop
-        self.fresh = fresh
+        self.fresh = fresh  # the first row that is not in an earlier band
         self.rows = slice(start, stop)
         self.shape = stop - start, width
+        # Of every texel, row after row; rows count from ``start``.
         index = dr.arange(mi.UInt32, self.shape[0] * width)
         self.row = index // dr.opaque(mi.UInt32, width)
         self.column = index - self.row * dr.opaque(mi.UInt32, width)
@@ -55,26 +46,7 @@ class Band:
 
 
 class Places:
-    """Where the texels of a source lie among rows of a coarser map.
-
-    Parameters
-    ----------
-    shape : (int, int)
-        Rows and columns of the source.
-    rows : Rows
-        Which rows of its map the coarser image is.
-    columns : int
-        Its columns.
-
-    Attributes
-    ----------
-    row, column : ndarray of int64 (H,), (W,)
-        The nearest texel of the coarser image.
-    place : ndarray (H,)
-        Row of the coarser image, with its fraction.
-    start, stop : int
-        Rows of the source whose nearest row is in the coarser image.
-    """
+    """Where the texels of a source of a ``shape`` lie among ``rows`` of a coarser map of so many columns."""
 
     def __init__(self, shape: tuple[int, int], rows: Rows, columns: int):
         self.shape = shape
@@ -82,20 +54,23 @@ class Places:
         self.count = rows.count
         self.columns = columns
         height, width = shape
-        place = np.arange(height) * ((rows.total - 1) / max(height - 1, 1)) - rows.first
-        nearest = np.rint(place)
+
+        # ---- Row of the coarser image with its fraction, the nearest, and the source's rows that have one
+        self.place = np.arange(height) * ((rows.total - 1) / max(height - 1, 1)) - rows.first
+        nearest = np.rint(self.place)
+        self.row = np.clip(nearest, 0, self.count - 1).astype(np.int64)
         inside = np.flatnonzero((nearest >= 0) & (nearest < self.count))
         self.start, self.stop = (int(inside[0]), int(inside[-1]) + 1) if len(inside) else (0, 0)
-        self.row = np.clip(nearest, 0, self.count - 1).astype(np.int64)
-        across = (np.arange(width) + 0.5) * (self.columns / width)
-        self.column = np.minimum(across.astype(np.int64), self.columns - 1)
-        self.place = place
+
+        # ---- The nearest column, its two borders, the four around, and the parts of a column beyond the left
+        across = (np.arange(width) + 0.5) * (columns / width)
+        self.column = np.minimum(across.astype(np.int64), columns - 1)
+        self._borders = [flat(mi.UInt32, (self.column + step).astype(np.uint32)) for step in (0, 1)]
+        self._beyond_border = flat(mi.Float, (across - self.column).astype(np.float32))
         left = np.floor(across - 0.5)
-        around = [(left + step) % self.columns for step in (0, 1, -1, 2)]
-        index = np.stack([*around, self.column, self.column + 1], axis=1).astype(np.uint32)
-        part = np.stack([across - 0.5 - left, across - self.column], axis=1).astype(np.float32)
-        self._index = [dr.opaque(mi.UInt32(np.ascontiguousarray(i))) for i in index.T]
-        self._part = [dr.opaque(mi.Float(np.ascontiguousarray(p))) for p in part.T]
+        around = [(left + step) % columns for step in (0, 1, -1, 2)]
+        self._around = [flat(mi.UInt32, column.astype(np.uint32)) for column in around]
+        self._beyond_left = flat(mi.Float, (across - 0.5 - left).astype(np.float32))
 
     def bands(self) -> Iterator[Band]:
         """Yield bands of one size over start to stop."""
@@ -108,7 +83,7 @@ class Places:
     def linear(self, kind: type[DrArray], band: Band, values: np.ndarray) -> DrArray:
         """Interpolate values (rows, w, C) linearly at the texels of a band; ``kind`` has C components."""
         place = np.clip(self.place[band.rows], 0, self.count - 1)
-        return self._across(kind, band, _between(values, place), self._index[:2], self._part[0])
+        return self._across(kind, band, _between(values, place), self._around[:2], self._beyond_left)
 
     def inside(self, band: Band, mask: np.ndarray) -> mi.Float:
         """Interpolate a mask (rows, w) by its corners: 0 wherever a texel is not in it."""
@@ -118,7 +93,7 @@ class Places:
         corners = np.concatenate([corners, corners[:, :1]], axis=1).astype(np.float64)
         place = np.clip(self.place[band.rows] + 0.5, 0, self.count)
         rows = _between(corners[..., None], place)
-        return self._across(mi.Float, band, rows, self._index[4:], self._part[1])
+        return self._across(mi.Float, band, rows, self._borders, self._beyond_border)
 
     def _across(self, kind, band, rows, index, part):
         """Interpolate along the columns values (size, columns, C) that are those of the band's rows."""
@@ -146,18 +121,18 @@ class Places:
         # ---- Along the columns
         table = flat(mi.Float, rows)
         begin = band.row * dr.opaque(mi.UInt32, self.columns)
-        offsets = (dr.gather(mi.UInt32, index, band.column) for index in self._index[:4])
+        offsets = (dr.gather(mi.UInt32, index, band.column) for index in self._around)
         a, b, before, after = (dr.gather(mi.Color3f, table, begin + offset) for offset in offsets)
-        return _keys(a, b, before, after, dr.gather(mi.Float, self._part[0], band.column))
+        return _keys(a, b, before, after, dr.gather(mi.Float, self._beyond_left, band.column))
 
     def nearest(self, kind: type[DrArray], band: Band, table: DrArray) -> DrArray:
         """Look up a table (size, w), of the band's rows, at its texels."""
         place = band.row * dr.opaque(mi.UInt32, self.columns)
-        return dr.gather(kind, table, place + dr.gather(mi.UInt32, self._index[4], band.column))
+        return dr.gather(kind, table, place + dr.gather(mi.UInt32, self._borders[0], band.column))
 
     def beside(self, band: Band) -> mi.Float:
         """Columns from the nearest, -1/2 to 1/2."""
-        return dr.gather(mi.Float, self._part[1], band.column) - 0.5
+        return dr.gather(mi.Float, self._beyond_border, band.column) - 0.5
 
 
 def _keys(a, b, before, after, part):

@@ -33,11 +33,8 @@ def declared(name: str) -> list:
     """Return the parts of a file, without pixels, once the sizes that they declare have been checked."""
     import OpenEXR
 
-    try:
-        with quiet_libraries():
-            parts = OpenEXR.File(name, header_only=True).parts
-    except Exception as e:  # the library raises bare RuntimeError for anything
-        raise damaged(name, e) from None
+    with _refusing(name), quiet_libraries():
+        parts = OpenEXR.File(name, header_only=True).parts
     windows = [_window(p.header["dataWindow"]) for p in parts]
     for _, _, width, height in windows:
         check_declared(name, width, height)
@@ -108,13 +105,9 @@ def read(name: str, head: bytes, info: Info, stored: bool) -> np.ndarray:
 
     decoded = _decoded(name, len(parts))[index]
     left, top, width, height = windows[index]
-    try:
+    with _refusing(name):
         info["half"] = all(decoded.channels[c].pixels.dtype == np.float16 for c in names)
         planes = [np.array(decoded.channels[c].pixels, np.float32) for c in names]
-    except MemoryError:
-        raise
-    except Exception as e:
-        raise damaged(name, e) from None
     if any(p.shape != (height, width) for p in planes):
         raise damaged(name, "not all of its channels could be decoded")
     display = _window(header["displayWindow"])
@@ -175,19 +168,25 @@ def _decoded(name, count):
     """Decode the parts of a file that declares so many."""
     import OpenEXR
 
-    try:
-        with quiet_libraries() as printed, on_cores():
-            # separate_channels: the interleaved form guesses at RGB(A) and leaves layers out.
-            parts = OpenEXR.File(name, separate_channels=True).parts
-    except MemoryError:
-        raise
-    except Exception as e:
-        raise damaged(name, e) from None
+    with _refusing(name), quiet_libraries() as printed, on_cores():
+        # separate_channels: the interleaved form guesses at RGB(A) and leaves layers out.
+        parts = OpenEXR.File(name, separate_channels=True).parts
     # A part that cannot be decoded is dropped with a printed warning, and the others move up.
     # The decoder of JPEG 2000 says that a stream ended early, and fills up with what it likes.
     if len(parts) != count or "terminated early" in (printed[0] if printed else ""):
         raise damaged(name, printed and printed[0] or "not all of its parts could be decoded")
     return parts
+
+
+@contextlib.contextmanager
+def _refusing(name):
+    """Take whatever the library raises, bare RuntimeError for anything, for damage of a file."""
+    try:
+        yield
+    except MemoryError:
+        raise
+    except Exception as e:
+        raise damaged(name, e) from None
 
 
 def _window(box):

@@ -96,17 +96,8 @@ class Dists:
     ``alpha (mu_x - mu_y)^2 / (mu_x^2 + mu_y^2 + c1) + beta var_(x - y) / (var_x + var_y + c2)``.
     Any image of at least one pixel will do.
 
-    Parameters
-    ----------
-    backbone : Backbone
-        VGG16.
-    weights_file : path-like
-        ``safetensors`` or ``npz`` with ``alpha`` and ``beta``, each (1, 1475, 1, 1).
-
-    Raises
-    ------
-    InputError
-        If the file does not hold the weights; see :func:`envedit.losses.perceptual.weights.read`.
+    The backbone is VGG16, the weights' file ``safetensors`` or ``npz`` with ``alpha`` and ``beta``, each
+    (1, 1475, 1, 1); errors as of :func:`.weights.read`.
     """
 
     def __init__(self, backbone: Backbone, weights_file: FilePath):
@@ -237,19 +228,9 @@ class Lpips:
     their length at each pixel; squared differences, weighted by channel, averaged over pixels, summed
     over layers. Images in [0, 1] are mapped to [-1, 1] first, which is the authors' ``normalize=True``.
 
-    Parameters
-    ----------
-    kind : str
-        "alex", "vgg" or "squeeze".
-    backbone : path-like or Backbone
-        Weights of the network, or their file; see `Backbone.load`.
-    heads_file : path-like
-        ``safetensors`` or ``npz`` with ``lin0.model.1.weight`` (1, C, 1, 1) and so on, one for every layer.
-
-    Raises
-    ------
-    InputError
-        If a file does not hold the weights; see :func:`envedit.losses.perceptual.weights.read`.
+    ``kind`` is "alex", "vgg" or "squeeze", ``backbone`` the network or its file (`Backbone.load`), the heads'
+    file ``safetensors`` or ``npz`` with ``lin0.model.1.weight`` (1, C, 1, 1) and so on, one for every layer;
+    errors as of :func:`.weights.read`.
     """
 
     def __init__(self, kind: str, backbone: FilePath | Backbone, heads_file: FilePath):
@@ -263,11 +244,8 @@ class Lpips:
     def __call__(self, a: Any, b: Any) -> float:
         """Compare two images ``(H, W, 3)``, arrays or tensors, in single precision.
 
-        Raises
-        ------
-        InputError
-            If they differ in shape, are too small for the network, or hold values that are not finite or so
-            large that their features are not.
+        InputError if they differ in shape, are too small for the network, or hold values that are not finite
+        or so large that their features are not.
         """
         a, b = (_single(image, f"LPIPS: {name} image") for image, name in ((a, "first"), (b, "second")))
         distance = float(self.distance(a, b)[0])

@@ -61,7 +61,6 @@ SMALL = 400
 MOST_DRAWN = 20
 """Lights that :func:`lights_figure` draws."""
 NUMBERS = {
-    "iterations": "iterations",
     "non_finite_steps": "steps that were not finite, and not taken",
     "turn_degrees": "turn of the whole sky (degrees)",
     "sun_offset_texels": "distance between the brightest texels of the edited and of the true map (texels)",
@@ -88,7 +87,7 @@ NUMBERS = {
     "transport predicted_error": "light transport, predicted relative error",
     "transport frozen": "share of texels that are frozen",
 }
-"""Numbers of metrics.json in words; terms that are ours are in docs/glossary.md."""
+"""Numbers of metrics.json in words, where these are not their keys; our terms are in docs/glossary.md."""
 STAGES = {
     "import": "importing",
     "target": "rendering the target",
@@ -101,7 +100,6 @@ STAGES = {
     "judge": "rendering the result",
     "full": "writing the maps, also at the resolution of the file",
     "report": "writing the report",
-    "total": "total",
     "per_iteration": "one iteration",
 }
 """Keys of the metrics' timing in words, without their units."""

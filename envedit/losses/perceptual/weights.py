@@ -29,6 +29,8 @@ _SAFETENSORS: dict[str, np.dtype] = {
     "F64": np.dtype("<f8"),
     "BF16": np.dtype("<u2"),
 }
+_NPZ_COMPRESSION = zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED
+_NPY_HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 
 def read(file: FilePath, shapes: dict[str, tuple[int, ...]], what: str, source: str) -> dict[str, np.ndarray]:
@@ -122,18 +124,13 @@ def _read_npz(name, stream, shapes, what, source):
         tensors = {}
         for tensor, shape in shapes.items():
             # LZMA, which numpy does not write, takes the memory that its header asks for.
-            if archive.getinfo(tensor + ".npy").compress_type not in (
-                zipfile.ZIP_STORED,
-                zipfile.ZIP_DEFLATED,
-            ):
+            if archive.getinfo(tensor + ".npy").compress_type not in _NPZ_COMPRESSION:
                 raise _damaged(name, f"'{tensor}' is compressed in a way that numpy does not use")
             with archive.open(tensor + ".npy") as member:
                 version = np.lib.format.read_magic(member)
-                if version not in ((1, 0), (2, 0)):
+                if version not in _NPY_HEADERS:
                     raise _damaged(name, f"'{tensor}' has an unknown version {version}")
-                old = version == (1, 0)
-                header = np.lib.format.read_array_header_1_0 if old else np.lib.format.read_array_header_2_0
-                declared, columns_first, dtype = header(member)
+                declared, columns_first, dtype = _NPY_HEADERS[version](member)
                 if dtype.kind != "f" or dtype.itemsize > 8:
                     raise _wrong_type(name, tensor, dtype)
                 _check_shape(name, tensor, declared, shape, what)

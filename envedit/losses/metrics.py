@@ -98,10 +98,6 @@ def compare(
 
     Parameters
     ----------
-    a, b : array (H, W, 3)
-        Linear radiance.
-    tonemap : str
-        A name of `envedit.core.color.TONEMAPS`.
     lpips : distances.Lpips, optional
         What measures LPIPS of the display values.
     seen : array of bool (H, W), optional
@@ -113,18 +109,17 @@ def compare(
     Returns
     -------
     dict
-        ``psnr`` (dB), ``ssim``, ``mse`` for a data range of 1, and ``lpips``, None without one, or where the
-        share of the samples that differ of which a display shows nothing: both black, or both white.
+        ``psnr`` (dB), ``ssim``, ``mse`` for a data range of 1; ``lpips``, None without one, or of images that
+        are too small for it; ``log_rmse``; and ``beyond_display``, the share of the samples that differ of
+        which a display shows nothing: both black, or both white.
     """
     radiance = _pair(a, b)
     a, b = (apply_tonemap(image, tonemap) for image in radiance)
-    views = views or (slice(0, len(a)),)
-    shares = [len(a[rows]) / len(a) for rows in views]
-    alike = sum(share * ssim(a[rows], b[rows]) for share, rows in zip(shares, views, strict=True))
+    parts = [(len(a[rows]) / len(a), a[rows], b[rows]) for rows in views or (slice(None),)]
+    alike = sum(share * ssim(x, y) for share, x, y in parts)
     apart = None
-    pairs = [(a[rows].astype(np.float32), b[rows].astype(np.float32)) for rows in views]
-    if lpips is not None and min(min(x.shape[:2]) for x, _ in pairs) >= lpips.backbone.least_size("max"):
-        apart = sum(share * float(lpips(*pair)) for share, pair in zip(shares, pairs, strict=True))
+    if lpips is not None and min(min(x.shape[:2]) for _, x, _ in parts) >= lpips.backbone.least_size("max"):
+        apart = sum(share * lpips(x, y) for share, x, y in parts)
     here = np.ones(a.shape[:2], bool) if seen is None or not np.any(seen) else seen
     a, b, radiance_a, radiance_b = (image[here][None] for image in (a, b, *radiance))
     shown = {"psnr": psnr(a, b), "ssim": alike, "mse": mse(a, b), "lpips": apart}

@@ -188,6 +188,4 @@ def ramp(start: float, end: float, step: float, total: int) -> float:
     if start == end:
         return start
     share = min(step / max(total - 1, 1), 1.0)
-    if share in (0.0, 1.0):
-        return end if share else start
-    return math.exp((1 - share) * math.log(start) + share * math.log(end))
+    return start ** (1 - share) * end**share

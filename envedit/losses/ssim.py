@@ -76,17 +76,9 @@ class Ssim:
     ``|x|`` over the local contrast. Squares must be representable: ``|x|`` up to 1e18 in single precision,
     NaN beyond.
 
-    Parameters
-    ----------
-    reference : tensor (H, W, C)
-        The image y; not differentiated.
-    weight : tensor (H, W, 1) or (H, W, C), optional
-        Weight of the window centred there, not negative; windows that cross an edge do not exist.
-
-    Raises
-    ------
-    InputError
-        If a shape does not fit.
+    The ``reference`` (H, W, C), y, is not differentiated. A ``weight``, (H, W, 1) or (H, W, C), not negative,
+    is that of the window centred there; windows that cross an edge do not exist. InputError if a shape does
+    not fit.
     """
 
     def __init__(self, reference: Tensor, weight: Tensor | None = None):
@@ -190,14 +182,8 @@ class Ssim:
 class StackedSsim:
     r"""Structural similarity of pictures below each other: no window crosses from one to the next.
 
-    ``sum_k s_k (1 - SSIM_k)``, where s_k is picture k's share of the weight, or of the pixels.
-
-    Parameters
-    ----------
-    reference, weight
-        As of :class:`Ssim`.
-    rows : sequence of slice
-        Of each picture, from the top, without gaps.
+    ``sum_k s_k (1 - SSIM_k)``, where s_k is picture k's share of the weight, or of the pixels; ``rows`` are
+    those of each picture, from the top, without gaps.
     """
 
     def __init__(self, reference: Tensor, weight: Tensor | None, rows: Views):

@@ -52,11 +52,8 @@ def _irradiance(first, second):
 def lights(first: np.ndarray, second: np.ndarray) -> dict:
     """Match the lights of two maps of one size (H, W, 3).
 
-    Returns
-    -------
-    dict
-        ``before`` and ``after`` of :func:`.light_list.matched`, the latter with ``stops_of_flux`` over that
-        of the light of the first map; None for one that is new.
+    Returns ``before`` and ``after`` of :func:`.light_list.matched`, the latter with ``stops_of_flux`` over
+    that of the light of the first map; None for one that is new.
     """
     separated = [file_lights.lights_of(envmap) for envmap in (first, second)]
     tables = [light_list.listed(own, first.shape[:2], np.eye(3)) for own in separated]

@@ -24,13 +24,8 @@ its axes for a direction (x, y, z) and its look-up:
 
 
 def turned_for(program: str, envmap: np.ndarray) -> np.ndarray:
-    """Return a map as a program expects it.
+    """Return a map (H, W, 3) as a program, one of :data:`QUARTERS`, expects it.
 
-    Parameters
-    ----------
-    program : str
-        One of :data:`QUARTERS`.
-    envmap : ndarray (H, W, 3)
-        Moved by whole columns, without a change of any value, where W is a multiple of 4.
+    It is moved by whole columns, without a change of any value, where W is a multiple of 4.
     """
     return latlong.rotate(envmap, -90.0 * QUARTERS[program])

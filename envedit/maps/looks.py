@@ -145,14 +145,12 @@ def lights_of(layers: Layers) -> dict[str, RoleLight]:
     sky = sky_irradiance(layers, layers.base)
     described: dict[str, RoleLight] = {}
     indices = roles(layers) if sky > 0 else {}
-    key_azimuth, key_elevation = 0.0, 0.0
+    places = {role: angles(layers.lights.centres[i]) for role, i in indices.items()}
     for role, i in indices.items():
-        azimuth, elevation = angles(layers.lights.centres[i])
-        if role == "key":
-            key_azimuth, key_elevation = azimuth, elevation
-        else:
-            azimuth = (azimuth - key_azimuth + 180) % 360 - 180
-            elevation = elevation - key_elevation
+        azimuth, elevation = places[role]
+        if role != "key":
+            azimuth = (azimuth - places["key"][0] + 180) % 360 - 180
+            elevation -= places["key"][1]
         flux = layers.lights.flux[i]
         light = float(flux @ LUMINANCE)
         size = radius(layers, i)

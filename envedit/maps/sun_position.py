@@ -31,10 +31,7 @@ class SunPosition:
 def moment(text: str) -> datetime.datetime:
     """Read a time in ISO 8601 with an offset from UTC, such as 2026-06-21T13:30+02:00 or ...T11:30Z.
 
-    Raises
-    ------
-    ConfigError
-        It is no such time, has no offset, or its year is not in :data:`YEARS`.
+    ConfigError if it is no such time, has no offset, or its year is not in :data:`YEARS`.
     """
     expected = "expected a time in ISO 8601 with its offset from UTC, such as 2026-06-21T13:30+02:00"
     try:

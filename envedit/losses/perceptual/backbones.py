@@ -109,12 +109,8 @@ class Backbone:
        taps = stack.taps(tape)              # [(flat array of N * C numbers, N, C), ...]
        gradient = stack.backward(tape, [gradient of the first tap, None, ...])
 
-    Parameters
-    ----------
-    kind : str
-        "vgg" (VGG16), "alex" (AlexNet) or "squeeze" (SqueezeNet 1.1).
-    tensors : dict
-        torchvision's state dict, as far as it is named ``features.*``: float32 arrays.
+    ``kind`` is one of :data:`KINDS`; ``tensors`` are torchvision's state dict, as far as it is named
+    ``features.*``: float32 arrays.
     """
 
     def __init__(self, kind: str, tensors: dict[str, np.ndarray]):

@@ -40,16 +40,9 @@ def read(file: FilePath, shapes: dict[str, tuple[int, ...]], what: str, source: 
     cannot be read, is damaged or of another format, or a tensor is missing, has another shape or type, or
     holds values that are not finite.
 
-    Parameters
-    ----------
-    file : path-like
-        The file. Its first bytes decide which format it has, not by its name.
-    shapes : dict
-        Name -> shape. Further tensors in the file are not looked at.
-    what : str
-        What the tensors are, for messages: "VGG16".
-    source : str
-        Where a user gets them, for messages.
+    The first bytes of the file decide which format it has, not its name. ``shapes`` are by name; further
+    tensors in the file are not looked at. Messages say ``what`` the tensors are, "VGG16", and the ``source``
+    where a user gets them.
     """
     # ---- Read, by the format that the first bytes show
     name = os.fsdecode(file)

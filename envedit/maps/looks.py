@@ -123,14 +123,12 @@ def roles(layers: Layers) -> dict[str, int]:
     flux = layers.lights.flux[:own] @ LUMINANCE
     if not own or not flux.max() > 0:
         return {}
-    key = int(np.argmax(flux))
+    key, *others = np.argsort(-flux, kind="stable").tolist()
     indices = {"key": key}
-    for i in np.argsort(-flux, kind="stable"):
-        if i == key or flux[i] < LEAST_SHARE * flux[key]:
-            continue
+    for i in (i for i in others if flux[i] >= LEAST_SHARE * flux[key]):
         apart = angles(layers.lights.centres[i])[0] - angles(layers.lights.centres[key])[0]
         behind = abs((apart + 180) % 360 - 180) > RIM_DEGREES
-        indices.setdefault("rim" if behind else "fill", int(i))
+        indices.setdefault("rim" if behind else "fill", i)
     return indices
 
 

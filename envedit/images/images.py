@@ -289,29 +289,14 @@ def write_exr(
 ) -> None:
     """Write an image as an OpenEXR file, of float32 unless asked for half, whole or not at all.
 
-    Marked as lat-long, unless it is no ``panorama``.
+    ``image`` (H, W, 3) is linear radiance, finite in float32; as half, at most :data:`.radiance.HALF_MAX`.
+    Its colours have ``chromaticities``, and are written as they are; None: Rec. 709. ``metadata`` are
+    attributes to add (str, int or float; anything else as its text), such as ``{"source": "sky.hdr"}``. A
+    ``panorama`` is marked as lat-long, which some viewers show as a sphere. ``alpha`` (H, W) is the share of
+    each pixel that is covered; the image is premultiplied by it.
 
-    Parameters
-    ----------
-    image : array (H, W, 3)
-        Linear radiance, finite in float32; as half, at most :data:`.radiance.HALF_MAX`.
-    metadata : dict, optional
-        Attributes to add (str, int or float; anything else as its text), such as ``{"source": "sky.hdr"}``.
-    panorama : bool
-        Mark it as a lat-long map, which some viewers show as a sphere.
-    alpha : array (H, W), optional
-        Share of each pixel that is covered; the image is premultiplied by it.
-    half : bool
-        Write 16 bits a channel, 11 of them digits.
-    chromaticities : tuple, optional
-        Of the image's colours, which are written as they are; None: Rec. 709.
-
-    Raises
-    ------
-    NumericalError
-        A value is not finite in the file; names the first texel.
-    InputError
-        The file cannot be written.
+    NumericalError names the first texel with a value that is not finite in the file; InputError if the file
+    cannot be written.
     """
     name = os.fsdecode(path)
     pixels = _checked(name, image)

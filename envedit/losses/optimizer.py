@@ -39,16 +39,9 @@ class Adam:
     refused as a whole. What a step leads to is seen in the next one only: `take_back` returns to the
     parameters before it.
 
-    Parameters
-    ----------
-    params : dict of str to tensor or array
-        Starting values; copied. Read them as ``adam.params[name]``.
-    lr : float
-        Learning rate of a `step` that is not given its own.
-    betas : (float, float)
-        Decay of the two moments, in [0, 1).
-    eps : float
-        Added to the root of the second moment; above 0, so that 0 / 0 cannot arise.
+    ``params``, tensors or arrays, are starting values, which are copied: read them as ``adam.params[name]``.
+    ``lr`` is that of a `step` that is not given its own, ``betas`` are the decay of the two moments, in
+    [0, 1), and ``eps`` is above 0, so that 0 / 0 cannot arise.
     """
 
     def __init__(

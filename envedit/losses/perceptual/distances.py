@@ -13,7 +13,7 @@ Weights are not part of the package: see `Backbone.load`, `DISTS_SOURCE` and `LP
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import drjit as dr
@@ -63,14 +63,13 @@ def _single(image: Any, name: str) -> mi.TensorXf:
 def _normalised(x: DrArray) -> DrArray:
     """Return a flat image as the networks take it."""
     F = type(x)
-    return (x - _by_channel(F, len(x), MEAN)) / _by_channel(F, len(x), DEVIATION)
+    return (x - _along(F(MEAN), len(x))) / _along(F(DEVIATION), len(x))
 
 
-def _by_channel(F: type[DrArray], length: int, values: Sequence[float]) -> DrArray:
-    """Repeat three constants along an image."""
-    channel = dr.arange(mi.UInt32, length) % 3
-    red, green, blue = (F(value) for value in values)
-    return dr.select(channel == 0, red, dr.select(channel == 1, green, blue))
+def _along(values: DrArray, length: int) -> DrArray:
+    """Repeat a number for each channel along a flat image or feature map."""
+    _, channel = Divisor(len(values)).split(dr.arange(mi.Int32, length))
+    return dr.gather(type(values), values, mi.UInt32(channel))
 
 
 # ---- DISTS -------------------------------------------------------------------------------------------------
@@ -186,7 +185,7 @@ class _DistsTo:
         score = type(x)(score)
         if not with_gradient:
             return score, None
-        gradient = self._stack.backward(tape, gradients[1:]) / _by_channel(type(x), len(x), DEVIATION)
+        gradient = self._stack.backward(tape, gradients[1:]) / _along(type(x)(DEVIATION), len(x))
         gradient += gradients[0]
         dr.eval(score, gradient)
         return score, gradient
@@ -204,12 +203,6 @@ def _means(values, channels):
 def _variances(values, mean):
     """Return the mean square of each channel's difference from its mean."""
     return _means(dr.square(values - _along(mean, len(values))), len(mean))
-
-
-def _along(values, length):
-    """Repeat a number for each channel along a feature map."""
-    _, channel = Divisor(len(values)).split(dr.arange(mi.Int32, length))
-    return dr.gather(type(values), values, mi.UInt32(channel))
 
 
 # ---- LPIPS -------------------------------------------------------------------------------------------------

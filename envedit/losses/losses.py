@@ -61,9 +61,7 @@ def luminance(x: Tensor, reference: Tensor) -> DrArray:
 def _luminance_sum(x):
     wide = dr.float64_array_t(type(x.array))  # 0.2126 in single precision is itself off by 1e-8
     channel = dr.arange(dr.uint32_array_t(wide), math.prod(x.shape)) % 3
-    red, green, blue = LUMINANCE
-    factor = dr.select(channel == 0, wide(red), dr.select(channel == 1, wide(green), wide(blue)))
-    return dr.sum(wide(x.array) * factor)
+    return dr.sum(wide(x.array) * dr.gather(wide, wide(LUMINANCE), channel))
 
 
 def l1(x: Tensor, reference: Tensor | None = None) -> DrArray:

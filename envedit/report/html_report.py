@@ -103,24 +103,20 @@ def _by_view(renders, views):
 
 
 def _pictures(names, by_view, maps, tonemap):
-    """Show renderings, a row for each view, and maps."""
-
-    def shown(pictures, what):
+    """Show renderings, a row for each view, and maps below each other."""
+    kinds = {f"rendering of {view}" if view else "rendering": renders for view, renders in by_view.items()}
+    rows = []
+    for what, pictures in [*kinds.items(), ("environment map", maps)]:
         stops = preview.stops_of(pictures.values())
-        return [
-            parts.figure(
-                preview.display(pictures[name], tonemap, stops), f"{name}, {what}{preview.exposed(stops)}"
-            )
-            if name in pictures
-            else f'<div class="unknown">{escape(f"{name}, {what}: not known")}</div>'
-            for name in names
-        ]
-
-    rows = [
-        parts.grid(shown(renders, f"rendering of {view}" if view else "rendering"))
-        for view, renders in by_view.items()
-    ]
-    rows.append(parts.grid(shown(maps, "environment map"), 1))
+        figures = []
+        for name in names:
+            caption = f"{name}, {what}"
+            if name in pictures:
+                pixels = preview.display(pictures[name], tonemap, stops)
+                figures.append(parts.figure(pixels, caption + preview.exposed(stops)))
+            else:
+                figures.append(f'<div class="unknown">{escape(caption)}: not known</div>')
+        rows.append(parts.grid(figures, 1 if pictures is maps else None))
     return (
         f"<h2>Renderings and maps</h2>{'<p></p>'.join(rows)}\n"
         f'<p class="soft">Tonemap of the pictures: {escape(tonemap)}.</p>'

@@ -98,9 +98,8 @@ def map_statistics(envmap: np.ndarray) -> list[str]:
     """Return the table's cells for one map (H, W, 3): its size, luminances, and where the peak is."""
     values = luminance(envmap.astype(np.float64))
     height, width = values.shape
-    weight = np.broadcast_to(np.reshape(solid_angles(height, width), (height, 1)), values.shape)
     row, column = np.unravel_index(np.argmax(values), values.shape)
-    mean = float((values * weight).sum() / weight.sum())
+    mean = float(np.average(values.mean(axis=1), weights=solid_angles(height, width)))
     return [
         f"{width} × {height}",
         show(values.max()),

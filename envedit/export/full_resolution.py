@@ -34,7 +34,7 @@ def carry(
     rows_working: Rows,
     free: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Apply an edit to the source of a working map.
+    """Apply an edit to the source of a working map; NumericalError names a texel that comes out non-finite.
 
     Layers are evaluated at the source's resolution (``docs/method.md``): its own texels without the cores of
     the lights, times gain and glow; the cores, of the source's own texels, where the lights have gone. A
@@ -76,11 +76,6 @@ def carry(
         the source is at least four times as wide; one that touches an unchanged texel cannot be darkened
         where a source texel lies in both. A source that is not larger than the working map takes
         the edited map's values, resized, where it was changed.
-
-    Raises
-    ------
-    NumericalError
-        If a texel comes out non-finite; names its row and column.
     """
     # ---- The edit, as layers or as a ratio of the working maps
     width = np.shape(edited_working)[1]

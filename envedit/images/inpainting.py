@@ -32,14 +32,8 @@ def filled(envmap: np.ndarray, weight: np.ndarray) -> np.ndarray:
 
     ``envmap`` (H, W, 3) float32 is linear radiance, finite and not negative; ``weight`` (H, W), 0 to 1, how
     far a texel is replaced: texels of weight 0 keep their bits. What is filled in is within the range of what
-    is :data:`RADIUS` pixels around the region, in each channel.
-
-    Raises
-    ------
-    NothingAroundError
-        The weight is above 0 everywhere.
-    MachineError
-        OpenCV is not installed.
+    is :data:`RADIUS` pixels around the region, in each channel. NothingAroundError if the weight is above 0
+    everywhere, MachineError if OpenCV is not installed.
     """
     cv2 = _opencv()
     mask = weight > 0

@@ -78,10 +78,7 @@ class Networks(NamedTuple):
 def load(settings: config.Config) -> Networks:
     """Settle a configuration by the weights that there are, and load the networks.
 
-    Raises
-    ------
-    InputError
-        A file cannot be read, or lacks a tensor.
+    InputError if a file cannot be read, or lacks a tensor.
     """
     from envedit.losses.perceptual import backbones, distances
 

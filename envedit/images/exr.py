@@ -114,7 +114,14 @@ def read(name: str, head: bytes, info: Info, stored: bool) -> np.ndarray:
     if stored and len(planes) in (1, 3) and windows[index] != display:
         planes.append(np.ones_like(planes[0]))  # what lies outside the data is transparent, not black
     image = np.stack(planes if stored or len(planes) == 3 else planes * 3, axis=-1)
-    _describe(header, info)
+
+    # ---- Plain attributes, and marks
+    info["metadata"] = {k: v for k, v in header.items() if isinstance(v, str | int | float)}
+    marks = info["marks"]
+    if header.get("chromaticities") is not None:
+        marks["chromaticities"] = header["chromaticities"]
+    marks["spaces"] = [v for k in _SPACE_NAMES if isinstance(v := header.get(k), str) and v]
+    marks["cube"] = "CUBE" in str(header.get("envmap", ""))
     return _to_display(image, (left, top), display, name, info)
 
 
@@ -240,16 +247,6 @@ def _rank(label):
         return 0
     match = re.search("(combined|beauty|rgba)(.?)", label.lower())
     return 3 if match is None else 2 if match[2] else 1
-
-
-def _describe(header, info):
-    """Take over the header's plain attributes and marks."""
-    info["metadata"] = {k: v for k, v in header.items() if isinstance(v, str | int | float)}
-    marks = info["marks"]
-    if header.get("chromaticities") is not None:
-        marks["chromaticities"] = header["chromaticities"]
-    marks["spaces"] = [v for k in _SPACE_NAMES if isinstance(v := header.get(k), str) and v]
-    marks["cube"] = "CUBE" in str(header.get("envmap", ""))
 
 
 def _to_display(image, corner, display, name, info):

@@ -102,10 +102,6 @@ class _Float32:
         self.order = ">" if state[1] == ">" else "<"
 
 
-def _numpy_array(*_: Any) -> _Array:
-    return _Array()
-
-
 def _torch_tensor(storage: np.ndarray, offset: int, shape: tuple, stride: tuple, *_: Any) -> _Array:
     expected = tuple(math.prod(shape[i + 1 :]) for i in range(len(shape)))
     if tuple(stride) != expected:
@@ -116,7 +112,7 @@ def _torch_tensor(storage: np.ndarray, offset: int, shape: tuple, stride: tuple,
 
 
 _KNOWN: dict[tuple[str, str], Any] = {
-    ("numpy.core.multiarray", "_reconstruct"): _numpy_array,
+    ("numpy.core.multiarray", "_reconstruct"): lambda *_: _Array(),
     ("numpy", "ndarray"): None,  # an argument of the former
     ("numpy", "dtype"): _Float32,
     ("torch._utils", "_rebuild_tensor_v2"): _torch_tensor,

@@ -153,11 +153,15 @@ class Convolution:
 
     def forward(self, x: DrArray) -> DrArray:
         """Return max(W patches + bias, 0)."""
+        windows = self._windows
         height = self._after[0]
         parts = []
         for first in range(0, height, self._rows):
             rows = min(self._rows, height - first)
-            patches = self._patches(x, first, rows)
+            i, row, column, tap_y, tap_x, c = windows.patches(first, rows)
+            under = windows.read(x, *windows.under(row, column, tap_y, tap_x, c))
+            patches = windows.write(type(x), under, i)
+            dr.eval(patches)
             product = dr.matmul(_rows_of(patches, self._columns), self._weights(type(x)), Bt=True).array
             _, channel = self._by_outputs.split(dr.arange(mi.Int32, len(product)))
             product += type(x)(dr.gather(mi.Float, self._bias, mi.UInt32(channel)))
@@ -181,13 +185,6 @@ class Convolution:
 
     def _weights(self, F):
         return self._matrix if F is type(self._matrix.array) else dr.tensor_t(F)(self._matrix)
-
-    def _patches(self, x, first, rows):
-        windows = self._windows
-        i, row, column, tap_y, tap_x, c = windows.patches(first, rows)
-        patches = windows.write(type(x), windows.read(x, *windows.under(row, column, tap_y, tap_x, c)), i)
-        dr.eval(patches)
-        return patches
 
     def _pull(self, gradient, first, stop, low, high):
         """Gradient of input rows first ... stop - 1, which the output rows low ... high - 1 depend on."""

@@ -198,19 +198,11 @@ def painted(
 ) -> dict:
     """Measure how far a painted picture was followed, and how still the rest was held.
 
-    On display values d, with coverage c in [0, 1], means over pixels and channels.
-
-    Parameters
-    ----------
-    edited, target, initial : array (h, w, 3)
-        The result's rendering, the painted picture and what it was painted on; linear radiance.
-    coverage : array (h, w, 1)
-        How much each pixel was painted.
-    seen : ndarray of bool (h, w), optional
-        Pixels that count; all by default.
-    noise : ndarray (h, w), optional
-        Standard error of the result's display values under "gamma"; that of the initial rendering, which is
-        in the target as well, is taken to be the same.
+    On display values d, with coverage c in [0, 1], means over pixels and channels. The result's rendering,
+    the painted picture and what it was painted on (h, w, 3) are linear radiance; ``coverage`` (h, w, 1) is
+    how much each pixel was painted, and ``seen`` (h, w) which pixels count. ``noise`` (h, w) is the standard
+    error of the result's display values under "gamma"; that of the initial rendering, which is in the target
+    as well, is taken to be the same.
 
     Returns
     -------

@@ -124,14 +124,10 @@ def prepare_folder(
     InputError if an input lies where a result would go, or the folder cannot be used. Of the results'
     ``names`` the first, which says that a run is complete, is moved first, and the last is a checkpoint's.
 
-    Parameters
-    ----------
-    inputs : sequence of path
-        What the run reads, and must not be moved; looked at where the folder holds any result.
-    keep : bool
-        Leave what is there, if it is complete or there is a checkpoint: it is to be continued.
-    spare : sequence of path
-        What is copied and not moved, if it is among the results: the run will be asked for by it again.
+    ``inputs`` are what the run reads, and must not be moved; they are looked at where the folder holds any
+    result. ``keep`` leaves what is there, if it is complete or there is a checkpoint: it is to be continued.
+    What is to ``spare`` is copied and not moved, if it is among the results: the run will be asked for by it
+    again.
     """
     try:
         # ---- What lies there, and whether an input is among it

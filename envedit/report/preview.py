@@ -104,16 +104,11 @@ def sheet(
 ) -> bytes:
     """Draw a row of renderings and under each its environment map, each row at the exposure of `stops_of`.
 
-    Returns a PNG file, whose text ``Description`` names the columns and the exposures.
-
-    Parameters
-    ----------
-    renders, maps : dict of str to array or None
-        Linear radiance, ``(H, W, 3)``, in the order of the columns, usually ``initial``, ``target``,
-        ``edited``. A map stands under the rendering of the same name; one that is missing or None (the true
-        map is not always known) leaves a grey rectangle. Maps are drawn 2:1.
-    views : sequence of slice
-        Rows of each view, where renderings are of several: they are drawn below each other.
+    Pictures ``(H, W, 3)`` are linear radiance, in the order of the columns, usually ``initial``, ``target``,
+    ``edited``. A map stands under the rendering of the same name; one that is missing or None (the true map
+    is not always known) leaves a grey rectangle. Maps are drawn 2:1, and renderings of several ``views``, of
+    which these are the rows, below each other. Returns a PNG file, whose text ``Description`` names the
+    columns and the exposures.
     """
     names = list(dict.fromkeys([*renders, *maps]))
     renders = known(renders)

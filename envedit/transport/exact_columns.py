@@ -29,29 +29,14 @@ _SEGMENTS = 16
 class ExactColumns:
     """Columns of T for some texels of a grid, traced on demand.
 
-    Parameters
-    ----------
-    scene : envedit.scene.Scene
-        Scene, camera and film.
-    grid : Grid
-        The texels.
-    bounces : int
-        Surface points along a path.
-    capacity : int
-        Most columns that will ever be held; their memory is taken at once, 16 bytes a pixel and column.
-    paths_bytes : int
-        Memory that camera paths may take, kept for the columns that are traced later.
+    Made for a scene, its camera and film, the texels of ``grid`` and paths of ``bounces`` surface points. The
+    memory of ``capacity`` columns, the most there will ever be, is taken at once, 16 bytes a pixel and
+    column; ``paths_bytes`` of camera paths are kept for columns that are traced later.
 
-    Attributes
-    ----------
-    texels : ndarray of int64 (n,)
-        Texels that have a column, in the order of their slots.
-    slot_of : ndarray of int64 (H * W,)
-        Slot of each texel's column; -1: none.
-    paths_of : ndarray of int64 (H * W,)
-        Camera paths a pixel that each texel's column was traced with; 0: none.
-    mask : Float (H * W,)
-        0 for texels with a column, 1 for others: what is left to the coarse tier.
+    ``texels`` (n,) int64 have a column, in the order of their slots. Of each texel of the grid, (H * W,),
+    ``slot_of`` is the slot of its column, -1 without one, ``paths_of`` the camera paths a pixel that it was
+    traced with, 0 without one, and ``mask`` (Float) 1 without a column, 0 with one: what is left to the
+    coarse tier.
     """
 
     def __init__(self, scene: Scene, grid: Grid, bounces: int, capacity: int, paths_bytes: int = 0):
@@ -64,7 +49,7 @@ class ExactColumns:
         self.slot_of = np.full(grid.texels, -1, np.int64)
         self.paths_of = np.zeros(grid.texels, np.int64)
         self.mask = dr.full(mi.Float, 1, grid.texels)
-        self._store = dr.zeros(mi.Float, _slices(self.pixels) * max(capacity, 1) * SLICE * 4)
+        self._store = dr.zeros(mi.Float, -(-self.pixels // SLICE) * max(capacity, 1) * SLICE * 4)
         self._texel_of = dr.zeros(mi.UInt32, max(capacity, 1))
         self._count = dr.opaque(mi.UInt32, 0)
         self._lost = dr.opaque(mi.UInt32, 0)
@@ -102,27 +87,19 @@ class ExactColumns:
         keep: np.ndarray | None = None,
         blocks: int | None = None,
     ) -> None:
-        """Trace columns; one that was there is replaced.
+        """Trace columns of distinct texels with so many camera paths a pixel; those that were are replaced.
 
-        Parameters
-        ----------
-        texels : ndarray of int64
-            Distinct texels, no more of them new than there is :attr:`room` and columns to give up.
-        count : int
-            Camera paths a pixel.
-        seed : int
-            Seed of every random choice.
-        keep : ndarray of int64, optional
-            Texels whose columns are given up for new ones last, the first of them last of all.
-        blocks : int, optional
-            Trace only so many blocks of pixels: enough to have all kernels, but no column to be used.
+        No more of them are new than there is :attr:`room` and columns to give up. Texels in ``keep`` give
+        their columns up last, the first of them last of all. Only so many ``blocks`` of pixels are traced, if
+        given: enough to have all kernels, but no column to be used.
         """
         self._take_slots(texels[self.slot_of[texels] < 0], texels, keep)
         self.paths_of[texels] = count
 
         for block in itertools.islice(self._paths(count, seed), blocks):
-            for some in _split(texels, max(1, MOST_VALUES // max(block.vertices, 1))):
-                self._add_vertices(block, some, count, seed)
+            most = max(1, MOST_VALUES // max(block.vertices, 1))
+            for start in range(0, len(texels), most):
+                self._add_vertices(block, texels[start : start + most], count, seed)
             if block.escapes:
                 self._add_escapes(block, texels)
         self._publish()
@@ -286,16 +263,6 @@ class ExactColumns:
 # ---- kernels -----------------------------------------------------------------------------------------------
 
 
-def _split(values, most):
-    """Cut an array into parts of at most so many."""
-    return [values[i : i + most] for i in range(0, len(values), most)]
-
-
-def _slices(n: int) -> int:
-    """Count the slices that ``n`` pixels fill."""
-    return (n + SLICE - 1) // SLICE
-
-
 def _first_place(pixel, capacity):
     """Packet of a pixel's entry in slot 0; those of the next slots follow at a distance of SLICE packets."""
     return (pixel // SLICE) * dr.opaque(mi.UInt32, capacity * SLICE) + pixel % SLICE
@@ -322,7 +289,7 @@ def _adjoint_parts(store, packets, count, pixels, capacity):
     lane = dr.arange(mi.UInt32, capacity * _SEGMENTS)
     size = dr.opaque(mi.UInt32, capacity)
     slot, segment = lane % size, lane // size
-    each = _slices((pixels + _SEGMENTS - 1) // _SEGMENTS) * SLICE
+    each = -(-pixels // (_SEGMENTS * SLICE)) * SLICE
     pixel = segment * dr.opaque(mi.UInt32, each)
     stop = dr.minimum(pixel + dr.opaque(mi.UInt32, each), dr.opaque(mi.UInt32, pixels))
     stop = dr.select(slot < count, stop, 0)

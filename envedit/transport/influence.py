@@ -26,26 +26,12 @@ def per_solid_angle(influence: np.ndarray) -> np.ndarray:
 
 
 def determined(influence: np.ndarray, samples: np.ndarray, rows: slice, threshold: float) -> np.ndarray:
-    """Say which texels a view determines.
+    """Say which texels a view determines: bool (H, W).
 
-    A texel is determined if it or a neighbour has more than ``threshold`` of the mean influence per solid
-    angle of the active rows. The neighbourhood is so wide that :data:`WANTED_SAMPLES` samples would have
-    found of it: noise may keep a texel that hardly matters, but does not take one that does.
-
-    Parameters
-    ----------
-    influence : ndarray (H, W)
-        T' 1.
-    samples : ndarray (H,)
-        Samples that a texel of each row has received.
-    rows : slice
-        The active rows.
-    threshold : float
-        Share of the mean; 0: all texels are determined.
-
-    Returns
-    -------
-    ndarray of bool (H, W)
+    A texel is determined if it or a neighbour has more than ``threshold`` of the mean influence (H, W), T' 1,
+    per solid angle of the active ``rows``; with 0 all are. The neighbourhood is so wide that of the
+    ``samples`` (H,) that a texel of each row has received :data:`WANTED_SAMPLES` would have found of it:
+    noise may keep a texel that hardly matters, but does not take one that does.
     """
     height, width = influence.shape
     if threshold <= 0:

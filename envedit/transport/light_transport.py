@@ -353,14 +353,8 @@ class LightTransport:
     def linear(self, maps: mi.TensorXf) -> mi.TensorXf:
         """Render maps without the light of other lamps: T E, not differentiable.
 
-        Parameters
-        ----------
-        maps : TensorXf (H, W, 3) or (k, H, W, 3)
-            Linear radiance, of any sign. Several are little more work than one.
-
-        Returns
-        -------
-        TensorXf (h, w, 3) or (k, h, w, 3)
+        ``maps`` (H, W, 3), or several (k, H, W, 3), are linear radiance of any sign; several are little more
+        work than one. Returns (h, w, 3), or (k, h, w, 3).
         """
         many = maps.shape[0] if maps.ndim == 4 else 1
         _check(maps, (*maps.shape[:-3], self.grid.height, self.grid.width, 3), "map")
@@ -374,21 +368,9 @@ class LightTransport:
     def pictures(self, maps: np.ndarray, rows: slice, most: int = COLUMNS_A_LOOK) -> np.ndarray:
         """Render maps that are black but for few texels, without the light of other lamps.
 
-        Costs what their texels cost, not what T does. The texels with most light get exact columns.
-
-        Parameters
-        ----------
-        maps : ndarray (k, rows, W, 3)
-            Radiance in some rows, of any sign.
-        rows : slice
-            Which rows.
-        most : int
-            Texels that get columns, at most.
-
-        Returns
-        -------
-        ndarray (k, h, w, 3) float32
-            In memory channel by channel.
+        ``maps`` (k, rows, W, 3) are radiance in some ``rows``, of any sign. Costs what their texels cost, not
+        what T does. The texels with most light, at most ``most``, get exact columns. Returns (k, h, w, 3)
+        float32, in memory channel by channel.
         """
         flat = maps.reshape(len(maps), -1, 3)
         some = np.flatnonzero(flat.any(axis=(0, 2)))
@@ -463,13 +445,7 @@ class LightTransport:
         return {**self._exact.state(), "looks": self._looks, **bright, "epoch": np.int64(self.epoch)}
 
     def restore(self, state: dict) -> None:
-        """Trace the columns of an earlier :meth:`state`.
-
-        Raises
-        ------
-        InputError
-            If it is no state of such a transport.
-        """
+        """Trace the columns of an earlier :meth:`state`; InputError if it is no state of such a transport."""
         own = {k: np.asarray(v) for k, v in state.items()}
         arrays = "columns", "paths", "looks", "bright", "recent"
         kept = {name: (own[name].dtype, (None,)) for name in arrays if name in own}

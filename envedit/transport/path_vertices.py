@@ -228,29 +228,11 @@ def on_device(kind: type[DrArray], values: np.ndarray) -> DrArray:
 def contributions(
     scene: mi.Scene, grid: Grid, block: Block, texels: np.ndarray, count: int, seed: int
 ) -> tuple[mi.Color3f, mi.UInt32]:
-    """Return what each of some texels adds to the pixels of a block by way of its vertices.
+    """Return what each of some ``texels`` (k,) adds to the pixels of a block by way of its vertices.
 
-    Parameters
-    ----------
-    scene : mi.Scene
-        What may block a ray.
-    grid : Grid
-        The texels' grid.
-    block : Block
-        Of paths.
-    texels : ndarray of int64 (k,)
-        Which texels.
-    count : int
-        Camera paths a pixel.
-    seed : int
-        Seed of the rays' directions.
-
-    Returns
-    -------
-    radiance : Color3f (k * pixels,)
-        For a radiance of 1 in the texel, texel by texel.
-    lost : UInt32
-        Contributions that were not finite, and were left out.
+    With ``count`` camera paths a pixel; ``seed`` is of the rays' directions. Returned are the radiance of
+    each pixel, (k * pixels,), for a radiance of 1 in the texel, texel by texel; and how many contributions
+    were not finite, and were left out.
     """
     lost = dr.opaque(mi.UInt32, 0)
     if not block.vertices:
@@ -308,9 +290,8 @@ def _connect(scene, grid, block, texels, each, count, values, lost):
         finite = dr.all(dr.isfinite(value))
         dr.scatter_add(lost, mi.UInt32(1), mi.UInt32(0), ~finite, mode=dr.ReduceMode.Local)
         value = dr.select(finite, value, 0)
-        dr.scatter(values[0], value.x, t * vertices + v)
-        dr.scatter(values[1], value.y, t * vertices + v)
-        dr.scatter(values[2], value.z, t * vertices + v)
+        for c in range(3):
+            dr.scatter(values[c], value[c], t * vertices + v)
         t += 1
 
 

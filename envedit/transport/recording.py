@@ -64,18 +64,9 @@ def connect(
 ) -> mi.Color3f:
     """Evaluate throughput * BSDF * visibility towards a direction, times its balance-heuristic weight.
 
-    Parameters
-    ----------
-    scene : mi.Scene
-        What may block the ray.
-    vertex : camera_paths.Vertex
-        Surface points.
-    direction : Vector3f
-        Unit vectors in the world, one a lane.
-    jacobian : Float
-        d(solid angle) / d(u, v) there; lanes where it is 0 (a pole) give 0.
-    sampled : Float
-        Solid-angle density of the texel sample there.
+    ``direction`` is a unit vector in the world for each lane of the vertex, ``jacobian`` d(solid angle) /
+    d(u, v) there, ``sampled`` the solid-angle density of the texel sample. Lanes with a jacobian of 0 (a
+    pole) give 0.
     """
     si = vertex.si
     bsdf = vertex.si.bsdf()
@@ -106,14 +97,8 @@ def contributions(
     probability P_j, adds throughput * f V J A_j / P_j, times its balance weight. A path that leaves the scene
     counts for one of the four texels around its direction, drawn by their tents.
 
-    Parameters
-    ----------
-    scene, pixels, bounces, seed, beyond
-        As of :func:`.camera_paths.trace`; with ``beyond`` the last batch has an array of bounces.
-    grid : Grid
-        Where the rays go.
-    spp : int
-        Camera paths a pixel.
+    Parameters are as of :func:`.camera_paths.trace`, with ``spp`` camera paths a pixel; with ``beyond`` the
+    last batch has an array of bounces.
     """
     lane = dr.arange(mi.UInt32, len(pixels) * spp)
     pixel = dr.gather(mi.UInt32, mi.UInt32(pixels), lane // spp)
@@ -182,12 +167,8 @@ def record_all(
 def pilot(scene: Scene, grid: Grid, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Measure where light comes from under a white sky, from a few samples of 4,096 to 16,384 pixels, or all.
 
-    Returns
-    -------
-    by_row : ndarray (H,)
-        Light by row of the map, of paths of at most :data:`MAX_BOUNCES` bounces.
-    by_bounce : ndarray (n,)
-        Light by bounce, to the end of the longest path; 0 is the sky seen directly, n > MAX_BOUNCES.
+    Returns the light by row of the map, (H,), of paths of at most :data:`MAX_BOUNCES` bounces; and by bounce,
+    (n,), to the end of the longest path: 0 is the sky seen directly, and n > MAX_BOUNCES.
     """
     pixels = np.arange(scene.width * scene.height, dtype=np.uint32)
     stride = max(1, int(np.sqrt(len(pixels) / 4096)))
@@ -221,12 +202,8 @@ def choose_bounces(scene: Scene, max_depth: int | str, by_bounce: np.ndarray) ->
     """Choose the surface points along a path from the light by bounce (n,) that :func:`pilot` found.
 
     ``max_depth`` is Mitsuba's path depth, taken as it is if it is a number, or "auto". Returned are the
-    bounces, path depth - 1, and what to report about an automatic choice.
-
-    Raises
-    ------
-    InputError
-        If no light arrives within that depth; it names the scene.
+    bounces, path depth - 1, and what to report about an automatic choice. InputError, which names the scene,
+    if no light arrives within that depth.
     """
     automatic = max_depth == "auto"
     most = MAX_BOUNCES + 1 if automatic else max_depth
@@ -249,12 +226,8 @@ def choose_samples(scene: Scene, spp: int | str, texels: int, memory_gb: float) 
 
     ``spp``, paths a pixel, is taken as it is if it is a number; "auto" is :data:`PATHS` over the pixels, or
     :func:`most_samples` if those are fewer. More columns than the map has ``texels`` are of no use. Returned
-    are paths a pixel, most exact columns, and what to report to the user.
-
-    Raises
-    ------
-    InputError
-        If the samples alone do not fit.
+    are paths a pixel, most exact columns, and what to report to the user. InputError if the samples alone do
+    not fit.
     """
     pixels = scene.width * scene.height
     spp = min(_automatic_spp(pixels), most_samples(pixels, memory_gb)) if spp == "auto" else int(spp)

@@ -88,12 +88,8 @@ def choose(
 ) -> SamplingPlan:
     """Choose how T of a scene is sampled, for maps of ``shape`` (H, W).
 
-    ``light`` is of :func:`white_sky`; other parameters are those of :meth:`.LightTransport.build`.
-
-    Raises
-    ------
-    InputError
-        As of :func:`.recording.choose_bounces` and :func:`.recording.choose_samples`.
+    ``light`` is of :func:`white_sky`; other parameters are those of :meth:`.LightTransport.build`. InputError
+    as of :func:`.recording.choose_bounces` and :func:`.recording.choose_samples`.
     """
     # ---- Path depth and samples
     by_row, by_bounce = light[0], light[1].copy()

@@ -19,18 +19,9 @@ SLICE = 8
 
 
 class ColourMatrix:
-    """Sparse (rows, columns) matrix of RGB weights: y[i, c] = sum_j w[i, j, c] x[j, c].
+    """Sparse matrix of RGB weights, of ``shape`` (rows, columns): y[i, c] = sum_j w[i, j, c] x[j, c].
 
-    Parameters
-    ----------
-    rows : ndarray of uint32 (nnz,)
-        Row of each entry, in any order.
-    columns : ndarray of uint32 (nnz,)
-        Column of each entry.
-    weights : ndarray of float32 (nnz, 3)
-        Its RGB weight.
-    shape : (int, int)
-        Number of rows and columns.
+    Made of the row and the column (nnz,) and the weights (nnz, 3) of its entries, in any order.
     """
 
     def __init__(self, rows: np.ndarray, columns: np.ndarray, weights: np.ndarray, shape: tuple[int, int]):
@@ -131,19 +122,10 @@ class ColourMatrix:
         return rows[real], packed[real, 3].copy().view(np.uint32), packed[real, :3]
 
     def transposed(self, rows: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """Multiply the transpose with vectors that are zero but for some rows.
+        """Multiply the transpose with vectors that are zero but for some distinct rows (n,).
 
-        Parameters
-        ----------
-        rows : ndarray of integers (n,)
-            Distinct rows.
-        values : ndarray (k, n, 3)
-            Their colours.
-
-        Returns
-        -------
-        ndarray (k, columns, 3) float32
-            In memory channel by channel.
+        ``values`` (k, n, 3) are their colours there. Returns (k, columns, 3) float32, in memory channel by
+        channel.
         """
         total = np.zeros((3, len(values), self.shape[1]), np.float32).transpose(1, 2, 0)
         if not len(rows):
@@ -164,17 +146,8 @@ class ColourMatrix:
     def apply(self, x: mi.Float, count: int = 1) -> list[mi.Color3f]:
         """Multiply with vectors of colours; reading the matrix once is most of what one product costs.
 
-        Parameters
-        ----------
-        x : Float
-            For each column a packet of each vector, of 4 floats (r, g, b, unused), flat: :func:`to_packets`.
-        count : int
-            How many vectors.
-
-        Returns
-        -------
-        list of Color3f
-            Of each vector one colour per row.
+        ``x`` has for each column a packet of each vector, of 4 floats (r, g, b, unused), flat:
+        :func:`to_packets`. Returns of each of the ``count`` vectors one colour per row.
         """
         products = _product(self._packed, x, self._start, self._stop, count)
         dr.eval(products)
@@ -240,14 +213,7 @@ def merge(
     key = rows.astype(np.int64) * width + columns
     order = np.argsort(key)
     key = key[order]
-    first = (
-        np.flatnonzero(np.concatenate([[True], key[1:] != key[:-1]])) if len(key) else np.zeros(0, np.int64)
-    )
-    total = (
-        np.add.reduceat(weights[order].astype(np.float64), first, axis=0) if len(key) else np.zeros((0, 3))
-    )
-    return (
-        (key[first] // width).astype(np.uint32),
-        (key[first] % width).astype(np.uint32),
-        total.astype(np.float32),
-    )
+    first = np.flatnonzero(np.diff(key, prepend=-1))
+    total = np.add.reduceat(weights[order].astype(np.float64), first, axis=0)
+    row, column = np.divmod(key[first], width)
+    return row.astype(np.uint32), column.astype(np.uint32), total.astype(np.float32)

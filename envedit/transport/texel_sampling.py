@@ -14,19 +14,11 @@ from envedit.core import latlong
 
 
 class Grid:
-    """The texels of an ``(H, W)`` map as sampling targets, in the world frame of one emitter.
+    """The texels of a map of ``height`` x ``width`` as sampling targets, in the world frame of one emitter.
 
-    A texel is chosen with probability mass[row] / W, then a direction in its tent. Densities over the (u, v)
-    square turn into densities over solid angle by the jacobian 2 pi^2 sin(theta).
-
-    Parameters
-    ----------
-    height, width : int
-        Rows and columns of the map.
-    to_world : ndarray (3, 3)
-        Rotation from the emitter's frame to the world.
-    mass : ndarray (H,)
-        Probability of each row, up to a factor; within a row all texels are equally likely.
+    ``to_world`` (3, 3) rotates the emitter's frame to the world. A texel is chosen with probability mass[row]
+    / W, ``mass`` (H,) up to a factor, then a direction in its tent. Densities over the (u, v) square turn
+    into densities over solid angle by the jacobian 2 pi^2 sin(theta).
     """
 
     def __init__(self, height: int, width: int, to_world: np.ndarray, mass: np.ndarray):
@@ -42,23 +34,9 @@ class Grid:
     def choose(self, u: mi.Point2f) -> tuple[mi.UInt32, mi.Vector3f, mi.Float, mi.Float, mi.Float]:
         """Choose a texel and a direction in its tent.
 
-        Parameters
-        ----------
-        u : Point2f
-            Uniform in [0, 1)^2; chooses row and column, and what is left places the direction.
-
-        Returns
-        -------
-        texel : UInt32
-            Index row * W + column.
-        direction : Vector3f
-            Unit vector in the world.
-        probability : Float
-            Probability of the texel.
-        area : Float
-            Area of the texel in the (u, v) square.
-        jacobian : Float
-            d(solid angle) / d(u, v) at the direction.
+        ``u``, uniform in [0, 1)^2, chooses row and column, and what is left of it places the direction.
+        Returned are the texel, row * W + column; the direction, a unit vector in the world; the texel's
+        probability, and its area in the (u, v) square; and d(solid angle) / d(u, v) at the direction.
         """
         row = dr.binary_search(0, self.height, lambda i: dr.gather(mi.Float, self.cdf, i + 1) <= u.x)
         row = dr.minimum(row, self.height - 1)
@@ -84,21 +62,10 @@ class Grid:
         return self.to_world @ local, 2 * dr.pi * dr.pi * dr.maximum(sin_theta, 0)
 
     def locate(self, direction: mi.Vector3f) -> tuple[list[tuple[mi.UInt32, mi.Float]], mi.Float, mi.Float]:
-        """Find the four texels around a world direction, with the weights of Mitsuba's bilinear lookup.
+        """Find the four texels around a world direction, a unit vector, and the weights of Mitsuba's lookup.
 
-        Parameters
-        ----------
-        direction : Vector3f
-            Unit vector in the world.
-
-        Returns
-        -------
-        taps : list of (UInt32, Float)
-            Four texels and their weights, which add up to 1.
-        position : Float
-            Fractional row, 0 ... H - 1.
-        jacobian : Float
-            d(solid angle) / d(u, v) at the direction.
+        Returned are the texels with their bilinear weights, which add up to 1; the fractional row, 0 ... H -
+        1; and d(solid angle) / d(u, v) at the direction.
         """
         d = self.to_world.T @ direction
         x = dr.atan2(d.x, -d.z) * dr.inv_two_pi * self.width - 0.5

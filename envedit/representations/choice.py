@@ -26,12 +26,8 @@ def make(
 ) -> Encoder:
     """Return the representation that a configuration asks for, of ``rows`` (first, total) of a map.
 
-    Not layers, which are made of a map: :func:`encoded`.
-
-    Raises
-    ------
-    ConfigError
-        As of :func:`.extensions.load`, of a kind that another package adds.
+    Not layers, which are made of a map: :func:`encoded`. ConfigError as of :func:`.extensions.load`, of a
+    kind that another package adds.
     """
     kind = settings.representation.kind
     if kind == "pixels":

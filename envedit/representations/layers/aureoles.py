@@ -95,14 +95,8 @@ class Sky:
 class Aureole:
     """The glow of one light on the device.
 
-    Parameters
-    ----------
-    glow : ndarray (len(GLOW_DEGREES), 3)
-        As of :class:`.separation.Light`.
-    home : ndarray (3,) or None
-        Where it has this glow; None: in a sky that is the same all around.
-    sky : Sky or None
-        The background that it brightens; None: c is 1.
+    ``glow`` (len(GLOW_DEGREES), 3) is as of :class:`.separation.Light`. At ``home`` (3,) it has this glow;
+    None: in a sky that is the same all around. ``sky`` is the background that it brightens; None: c is 1.
     """
 
     def __init__(self, glow: np.ndarray, home: np.ndarray | None, sky: Sky | None):

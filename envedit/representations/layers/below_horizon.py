@@ -110,16 +110,9 @@ class Below:
     above, without cores of lights, and ``above`` these with cores: ground is lit by them, or keeps its
     brightness without. ``kind`` is "mirror" or "keep".
 
-    Attributes
-    ----------
-    light : GroundLight or None
-        What falls on ground that it lights; None of a mirror, and of ground that keeps its brightness.
-    mirrored : ndarray of int64 (rows,)
-        The row of the sky that each row mirrors.
-    fade : ndarray (rows,)
-        f of each row.
-    widest : float
-        Greatest standard deviation of K, degrees.
+    Of each row, (rows,), ``mirrored`` is the row of the sky that it mirrors and ``fade`` its f. ``widest`` is
+    the greatest standard deviation of K, degrees. ``light`` is what falls on ground that it lights; None of a
+    mirror, and of ground that keeps its brightness.
     """
 
     def __init__(self, radiance: np.ndarray, sky: np.ndarray, kind: str, above: np.ndarray | None = None):

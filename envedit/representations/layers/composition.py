@@ -72,18 +72,10 @@ class Composed(NamedTuple):
 
 
 def compose(base: mi.Color3f, directions: mi.Vector3f | None, fields: Fields) -> Composed:
-    """Compose texels of a map, but for the cores of its lights, differentiably.
+    """Compose texels (n,) of a map, but for the cores of its lights, differentiably.
 
-    Where no field changes a texel, the sky is ``base``, bit for bit.
-
-    Parameters
-    ----------
-    base : Color3f (n,)
-        Linear radiance of the original without the cores of its lights.
-    directions : Vector3f (n,) or None
-        Unit vectors through the texels; None where there are no glows.
-    fields : Fields
-        What the edit does.
+    ``base`` is linear radiance of the original without the cores, ``directions`` are unit vectors through the
+    texels; None where there are no glows. Where no field changes a texel, the sky is ``base``, bit for bit.
     """
     # ---- Lights: their glow, and what it had hidden
     factor, gone = None, None

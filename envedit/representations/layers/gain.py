@@ -88,14 +88,9 @@ class Octave:
 class GridGain:
     """Log gain per channel on grids of quadratic B-splines.
 
-    Parameters
-    ----------
-    cycles : int
-        Cycles around the horizon that the finest grid can hold: it has twice as many columns.
-    share : float
-        Rows of the image over rows of its map: the grids are as fine in elevation as in azimuth.
-    top : bool
-        The image begins at the zenith.
+    The finest grid can hold ``cycles`` around the horizon: it has twice as many columns. ``share`` is rows of
+    the image over rows of its map: the grids are as fine in elevation as in azimuth. With ``top`` the image
+    begins at the zenith.
     """
 
     def __init__(self, cycles: int, share: float, top: bool = True):

@@ -29,16 +29,9 @@ LEAST_IRRADIANCE = 1e-30
 class GroundLight:
     """Irradiance of a horizontal plane under rows ``above`` the horizon (rows, W, 3), with cores of lights.
 
-    ``ground`` (low, W, 3) are the rows below.
-
-    Attributes
-    ----------
-    initial : ndarray (3,)
-        H_0.
-    albedo : float
-        Median of pi times the ground's luminance over that of H_0; 0 of black.
-    cosine : ndarray (rows, 1)
-        What a texel's radiance is multiplied by in H: its solid angle times the cosine.
+    ``ground`` (low, W, 3) are the rows below. ``initial`` (3,) is H_0, ``albedo`` the median of pi times the
+    ground's luminance over that of H_0, 0 of black. In H a texel's radiance is multiplied by ``cosine``
+    (rows, 1): its solid angle times the cosine.
     """
 
     def __init__(self, above: np.ndarray, ground: np.ndarray):

@@ -30,24 +30,10 @@ def shares(path: str) -> tuple[float, float]:
 def sampled(path: str, u: np.ndarray, v: np.ndarray, spacing: float) -> np.ndarray:
     """Interpolate an image at places, from averages of as many pixels as lie between two of them.
 
-    Parameters
-    ----------
-    path : str
-        Of a file that :func:`.images.read` reads.
-    u, v : ndarray (...)
-        Shares of its width from the left and of its height from the top; beyond its border it goes on.
-    spacing : float
-        Of the places, as a share of the longer side.
-
-    Returns
-    -------
-    ndarray (..., 3) float32
-        Linear radiance over the image's largest luminance.
-
-    Raises
-    ------
-    InputError
-        The file cannot be read, is black, or has a value that is no radiance.
+    ``path`` is a file that :func:`.images.read` reads. ``u`` and ``v`` (...) are shares of its width from the
+    left and of its height from the top; beyond its border it goes on. ``spacing`` of the places is a share of
+    the longer side. Returns (..., 3) float32, linear radiance over the image's largest luminance. InputError
+    if the file cannot be read, is black, or has a value that is no radiance.
     """
     levels = _levels(path)
     pixels = max(levels[0].shape[:2])

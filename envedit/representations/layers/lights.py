@@ -73,34 +73,21 @@ may fall into one texel."""
 class Lights:
     """The lights of a map at one resolution, as points.
 
-    Parameters
-    ----------
-    lights : list of Light
-        Of a :class:`.separation.Separation`.
-    rows : (int, int)
-        First row of the image that the lights' texels refer to in its map, and the rows of that map.
-    width : int
-        Its columns.
-    aureoles : bool or ndarray (len(GLOW_DEGREES), 3)
-        Spare lights have a glow; without it what surrounds a light that is added is left to the gain. A table
-        is the glow that they have.
-    background : ndarray (rows, W, 3), optional
-        The map without its lights; by default glows are as bright wherever their lights are.
+    ``lights`` are of a :class:`.separation.Separation`. Their texels refer to an image of ``width`` columns;
+    ``rows`` are its first row in its map, and the rows of that map. With ``aureoles`` spare lights have a
+    glow, or that of a table (len(GLOW_DEGREES), 3); without, what surrounds a light that is added is left to
+    the gain. ``background`` (rows, W, 3) is the map without its lights; by default glows are as bright
+    wherever their lights are.
 
-    Attributes
-    ----------
-    count, own : int
-        Lights, spare ones included; those of the map.
-    centres : ndarray (count, 3)
-        Directions of unmoved lights; spare ones are at the zenith.
-    flux : ndarray (count, 3)
-        Flux of unmoved lights, radiance times steradian; spare ones have the mean of the others, at least
-        :data:`FAINTEST` of it in every channel, or 1; in a sky where no light has a glow, scaled to
-        :data:`.CLEAR_FLUX` of its irradiance.
-    glows : list of ndarray (len(GLOW_DEGREES), 3) or None
-        As of :class:`.separation.Light`, of lights of :attr:`flux`. Spare ones have that of the strongest
-        light with a glow, in proportion to flux, or of a sun in a clear sky where none has one; or the table
-        of ``aureoles``.
+    Of ``count`` lights, spare ones included, the map's ``own`` come first:
+
+    - ``centres`` (count, 3) are directions of unmoved lights; spare ones are at the zenith.
+    - ``flux`` (count, 3) is that of unmoved lights, radiance times steradian; spare ones have the mean of the
+      others, at least :data:`FAINTEST` of it in every channel, or 1; in a sky where no light has a glow,
+      scaled to :data:`.CLEAR_FLUX` of its irradiance.
+    - ``glows`` are tables as of :class:`.separation.Light`, or None. Spare lights have that of ``aureoles``
+      or of the strongest light with a glow, in proportion to flux, or of a sun in a clear sky where none has
+      one.
     """
 
     def __init__(
@@ -190,22 +177,12 @@ class Lights:
         shape: tuple[int, int],
         rows: tuple[int, int],
     ) -> mi.TensorXf:
-        """Render the cores.
+        """Render the cores: linear radiance (rows, W, 3); what falls on rows that are not wanted is lost.
 
-        Parameters
-        ----------
-        turn, log_flux : TensorXf (count, 3)
-            Rotation vectors, axis times angle in radians, from where the light was; logarithm of the flux
-            over that of :attr:`flux`.
-        log_size : TensorXf (count, 1)
-            Logarithm of the size over what it was.
-        shape, rows : (int, int)
-            Rows and columns wanted; first row in the map, and the rows of the map, at that resolution.
-
-        Returns
-        -------
-        TensorXf (rows, W, 3)
-            Linear radiance; what falls on rows that are not wanted is lost.
+        ``turn`` (count, 3) are rotation vectors, axis times angle in radians, from where the light was;
+        ``log_flux`` (count, 3) and ``log_size`` (count, 1) are logarithms of flux and size over what they
+        were. Wanted are the rows and columns of ``shape``; ``rows`` are the first of them in the map, and the
+        rows of the map, at that resolution.
         """
         centre = dr.gather(mi.Vector3f, self._centre, self._which)
         size = dr.exp(dr.clip(dr.matmul(self._owner, log_size).array, *LOG_SIZES))
@@ -284,19 +261,10 @@ def placed(
 ) -> tuple[mi.Float, mi.Float, mi.Float]:
     """Return where points of lights come to lie: row, column and half-width in columns, each Float (n,).
 
-    Parameters
-    ----------
-    point, centre, turn : Vector3f (n,)
-        Direction of a point, centre and rotation vector of its light.
-    size : Float
-        Size of the light over what it was.
-    wide : Float (n,)
-        Width that the point is to have, in columns at the equator: size times the sine of the polar angle of
-        the texel that it came from.
-    finer : float
-        Columns of the grid over columns of the map that the points came from.
-    grid : (int, int)
-        Rows and columns of the whole map.
+    Of each point (n,) there are its direction, the centre and the rotation vector of its light, the light's
+    size over what it was, and the width that it is to have, ``wide``, in columns at the equator: size times
+    the sine of the polar angle of the texel that it came from. ``grid`` are rows and columns of the whole
+    map, and ``finer`` its columns over those of the map that the points came from.
     """
     total, width = grid
     along = dr.dot(point, centre)
@@ -324,25 +292,12 @@ def shared_out(
     page: mi.Int32 | int = 0,
     pages: int = 1,
 ) -> mi.TensorXf:
-    """Share points out among the texels around them.
+    """Share points (n,) out among the texels around them: linear radiance (rows, W, 3).
 
-    Parameters
-    ----------
-    row, column, half : Float (n,)
-        As :func:`placed` returns them.
-    flux : Color3f (n,)
-        Radiance times steradian.
-    half_row : float
-        Half-width of a tent in rows, at least 1.
-    shape, rows : (int, int)
-        As in :meth:`Lights.core`.
-    page, pages : Int32 (n,), int
-        Which of several images each point is of, and how many there are.
-
-    Returns
-    -------
-    TensorXf (rows, W, 3), or (pages, rows, W, 3) where there are several
-        Linear radiance; what falls on rows that are not wanted is lost.
+    ``row``, ``column`` and ``half`` are as :func:`placed` returns them, ``flux`` is radiance times steradian,
+    ``half_row`` the half-width of a tent in rows, at least 1. ``shape`` and ``rows`` are as in
+    :meth:`Lights.core`; what falls on other rows is lost. With several ``pages``, the result is (pages, rows,
+    W, 3), and ``page`` is the image that each point is of.
     """
     page = dr.opaque(mi.Int32, 0) if pages == 1 else page
     return dr.custom(_Share, row, column, half, flux, half_row, shape, rows, page, pages)

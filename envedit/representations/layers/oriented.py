@@ -94,27 +94,13 @@ def add_rotated(envmap: np.ndarray, light: Light, matrix: np.ndarray, flux: np.n
 def resampled(
     image: np.ndarray, matrix: np.ndarray, rows: tuple[int, int], target: tuple[int, int], samples: int
 ) -> np.ndarray:
-    """Average the rotated interpolant of a map over texels of the same grid.
+    """Average the rotated interpolant of a map over texels of the same grid: (target rows, W, 3) float32.
 
     Each texel is divided into ``samples`` x ``samples`` parts, weighted by their solid angles, and the map is
-    interpolated at their middles as Mitsuba interpolates it.
-
-    Parameters
-    ----------
-    image : ndarray (rows, W, 3) float32
-        Rows of a map; black elsewhere.
-    matrix : ndarray (3, 3)
-        Takes directions of the map to those of the rotated one.
-    rows : (int, int)
-        First row of the image in its map, and the rows of the map.
-    target : (int, int)
-        Rows of the rotated map to return: the first, and the first that is not.
-    samples : int
-        Points along either side of a texel.
-
-    Returns
-    -------
-    ndarray (target rows, W, 3) float32
+    interpolated at their middles as Mitsuba interpolates it. ``image`` (rows, W, 3) float32 is some rows of a
+    map, black elsewhere; ``rows`` are its first in the map, and the rows of the map. ``matrix`` (3, 3) takes
+    directions of the map to those of the rotated one, of which the rows from the first of ``target`` up to
+    its second are returned.
     """
     # ---- The source on the device, and places of samples within a texel
     width = image.shape[1]

@@ -44,14 +44,8 @@ class PlacedLights:
     """A map whose lights can be placed anew.
 
     ``envmap`` (H, W, 3) float32 is linear radiance, finite and not negative; ``horizon`` what rows below the
-    horizon do, as of :class:`.Layers`, or "auto".
-
-    Attributes
-    ----------
-    layers : Layers
-        The separated map.
-    lights : list of Light
-        Its lights, those with most flux first: ``light = 1`` is the first.
+    horizon do, as of :class:`.Layers`, or "auto". ``layers`` is the separated map, ``lights`` are its lights,
+    those with most flux first: ``light = 1`` is the first.
     """
 
     def __init__(self, envmap: np.ndarray, horizon: str = "auto"):

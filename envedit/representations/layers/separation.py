@@ -125,21 +125,12 @@ def separate(
 ) -> Separation:
     """Separate the lights of a map from its background.
 
-    Parameters
-    ----------
-    image : ndarray (rows, W, 3)
-        Linear radiance, finite and not negative.
-    rows : (int, int), optional
-        First row of the image in its map, and the rows of that map; None: the image is a whole map.
-    most : int
-        Most lights, those with most flux; weaker ones stay in the background.
-    survey : Survey, optional
-        Of a larger part of the map, of which the image is a band; None: of the image.
+    ``image`` (rows, W, 3) is linear radiance, finite and not negative; ``rows`` are its first row in its map,
+    and the rows of that map, by default of a whole map. Of the lights those ``most`` with most flux are
+    separated; weaker ones stay in the background. ``survey`` is of a larger part of the map, of which the
+    image is a band; None: of the image.
 
-    Returns
-    -------
-    Separation
-        Without lights where nothing stands out: the background is the image then, bit for bit.
+    Where nothing stands out there are no lights: the background is the image then, bit for bit.
     """
     image = np.asarray(image, np.float64)
     first, total = rows or (0, image.shape[0])

@@ -151,10 +151,7 @@ def coloured(light: ClippedLight, flux: float) -> np.ndarray:
 def flux_of_ratio(light: ClippedLight, ratio: float) -> float:
     """Return the flux, luminance, of a sun whose horizontal irradiance is ``ratio`` times the sky's.
 
-    Raises
-    ------
-    ConfigError
-        It stands less than :data:`LEAST_ELEVATION` above the horizon.
+    ConfigError if it stands less than :data:`LEAST_ELEVATION` above the horizon.
     """
     if light.elevation < LEAST_ELEVATION:
         raise ConfigError(

@@ -89,12 +89,8 @@ def directions(height: int, width: int, first: int = 0, total: int | None = None
 def forward(params: Params, x: mi.TensorXf, omega: float) -> tuple[mi.TensorXf, list]:
     """Evaluate the network at coordinates ``x`` (N, inputs).
 
-    Returns
-    -------
-    y : TensorXf
-        Values (N, outputs) in (0, 1).
-    tape : list
-        Per layer its input and omega * cos, and the output: what :func:`backward` needs.
+    Returns values (N, outputs) in (0, 1), and a tape: per layer its input and omega * cos, and the output,
+    which is what :func:`backward` needs.
     """
     last = layers(params) - 1
     tape = []

@@ -25,19 +25,11 @@ def last_layer(
 
     Gauss-Newton on sum_i w_i (sigmoid(W h_i + b) - y_i)^2 + ridge |step|^2, channel by channel, in float64.
     The weight of a point is 1 + share * E_i / mean(E): points count by themselves, and by the light that they
-    hold, so that the sum of light comes out right. Returns the parameters with another last layer; a channel
-    whose solution is not finite or worse stays.
+    hold, so that the sum of light comes out right.
 
-    Parameters
-    ----------
-    params, x, omega
-        A fitted network (see :mod:`.network`), its points (N, inputs), and its angular frequency.
-    target : ndarray (N, outputs)
-        Values in [0, 1].
-    light : ndarray (N, outputs)
-        E, what the points hold, at least 0.
-    share : float
-        Weight of the light.
+    ``params`` are of a fitted network (:mod:`.network`) of angular frequency ``omega``, ``x`` (N, inputs) its
+    points, ``target`` (N, outputs) is in [0, 1], and ``light`` (N, outputs) is E, at least 0. Returns the
+    parameters with another last layer; a channel whose solution is not finite or worse stays.
     """
     # ---- Features, their weights, and the layer as it is
     last = siren.layers(params) - 1

@@ -36,14 +36,8 @@ FINEST = 1 / 32
 class Placement:
     """Where a point of the rendering lies in the photograph.
 
-    Attributes
-    ----------
-    right, down : float
-        Shift, as a share of the rendering's width.
-    scale : float
-        Distances in the photograph over those in the rendering.
-    degrees : float
-        Rotation, from right to down.
+    ``right`` and ``down`` are its shift, as shares of the rendering's width, ``scale`` is distances in the
+    photograph over those in the rendering, ``degrees`` its rotation, from right to down.
     """
 
     right: float = 0.0
@@ -67,19 +61,9 @@ class Placement:
         return np.array([self.right / MOST_SHIFT, self.down / MOST_SHIFT, size, self.degrees / MOST_ROTATION])
 
     def sampled(self, picture: np.ndarray, height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
-        """Sample a picture of the photograph at the pixels of a film, bilinearly.
+        """Sample a picture (H, W, k) of the photograph at the pixels of a film of its aspect, bilinearly.
 
-        Parameters
-        ----------
-        picture : ndarray (H, W, k)
-            On a film of the same aspect, of any size.
-        height, width : int
-            Of the film.
-
-        Returns
-        -------
-        ndarray (height, width, k), ndarray of bool (height, width)
-            Values, and which of them the photograph has.
+        Returns values (height, width, k), and which of them, (height, width), the photograph has.
         """
         rows, columns, _ = picture.shape
         y, x = np.mgrid[:height, :width] + 0.5
@@ -98,21 +82,10 @@ class Placement:
 
 
 def find(photo: np.ndarray, rendering: np.ndarray) -> tuple[Placement, bool]:
-    """Find where a photograph lies.
+    """Find where a photograph lies, and whether outlines agree at all; as it is, if no place agrees better.
 
-    Parameters
-    ----------
-    photo : ndarray (H, W)
-        Its luminance, of the aspect of the rendering.
-    rendering : ndarray (h, w)
-        Luminance under light from everywhere.
-
-    Returns
-    -------
-    Placement
-        As it is, where no other one agrees better.
-    bool
-        Whether outlines agree at all.
+    ``photo`` (H, W) is its luminance, of the aspect of the ``rendering`` (h, w), the luminance under light
+    from everywhere.
     """
     # ---- Edges of both
     height, width = rendering.shape

@@ -46,12 +46,7 @@ def initial(scene: Scene, envmap: np.ndarray, settings: config.Config) -> np.nda
 def check_export(file: FilePath) -> None:
     """Refuse a file that :func:`export` should not write.
 
-    Raises
-    ------
-    ConfigError
-        If its ending says neither OpenEXR nor PNG.
-    InputError
-        If it exists, or its folder does not.
+    ConfigError if its ending says neither OpenEXR nor PNG, InputError if it exists, or its folder does not.
     """
     file = Path(os.fsdecode(file))
     if file.suffix.lower() not in ENDINGS:
@@ -92,12 +87,8 @@ def export(
 
     It is float32 OpenEXR, or 16-bit PNG. The file says which tonemap it is under (``name``, by default
     :func:`export_tonemap`), and what it was rendered from. As editors drop that, a file beside it, with
-    :data:`NEIGHBOUR` after its name, says it too.
-
-    Raises
-    ------
-    ConfigError, InputError
-        As :func:`check_export`, or if the file cannot be written.
+    :data:`NEIGHBOUR` after its name, says it too. Errors are those of :func:`check_export`, and InputError if
+    the file cannot be written.
     """
     check_export(file)
     linear = Path(os.fsdecode(file)).suffix.lower() == ".exr"
@@ -146,10 +137,8 @@ def stated_origin(file: FilePath, info: Info, expected: Mapping[str, object]) ->
     :func:`envedit.images.images.read_stored`, ``expected`` what an export of this run says. What is returned
     is as :func:`origin`, values as text; empty where nothing is said.
 
-    Raises
-    ------
-    InputError
-        If a value of :data:`KEYS` is not that of this run: the rendering is not the one that was painted on.
+    InputError if a value of :data:`KEYS` is not that of this run: the rendering is not the one that was
+    painted on.
     """
     file = Path(os.fsdecode(file))
     facts = {k[len(_PREFIX) :]: str(v) for k, v in info["metadata"].items() if k.startswith(_PREFIX)}

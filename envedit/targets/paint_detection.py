@@ -22,18 +22,11 @@ JPEG_SHARE = 1 / 3
 def differs(values: np.ndarray, before: np.ndarray, info: Info, top: int, spread: int = 0) -> np.ndarray:
     """Return where (h, w) a picture was painted.
 
-    Parameters
-    ----------
-    values, before : array (h, w, 3) float64
-        The picture, and what it was painted on: linear radiance of a float file, else display
-        values in [0, 1].
-    info : dict
-        Of :func:`envedit.images.images.read_stored`.
-    top : int
-        Largest code of the file, 255 or 65535; not used for float files.
-    spread : int
-        Over how many pixels resampling has mixed the values: one within the range that ``before`` has so
-        near, or beyond it by :data:`OVERSHOOT`, is not painted.
+    ``values`` and ``before`` (h, w, 3) float64 are the picture, and what it was painted on: linear radiance
+    of a float file, else display values in [0, 1]. ``info`` is of :func:`envedit.images.images.read_stored`,
+    ``top`` the largest code of the file, 255 or 65535, not used for float files. Over ``spread`` pixels
+    resampling has mixed the values: one within the range that ``before`` has so near, or beyond it by
+    :data:`OVERSHOOT`, is not painted.
     """
     if spread:
         planes = np.moveaxis(before, 2, 0)

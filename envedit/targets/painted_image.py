@@ -39,40 +39,26 @@ def read(
     mask: FilePath = "",
     exported: Mapping[str, object] = NOTHING,
 ) -> Painted:
-    """Read a painted picture.
+    """Read a painted picture, for a rendering of ``shape`` (h, w).
 
     - Float files are linear radiance. Others are undone by the tonemap that they were painted under:
-      ``tonemap_name``, where one is declared; else the one that the file names, or that of the export, unless
-      the unpainted pixels are those of the rendering under another.
+      ``tonemap_name``, where it is one of ``color.TONEMAPS`` and not "auto"; else the one that the file
+      names, or that of the export, unless the unpainted pixels are those of the rendering under another.
     - A picture of another size and the rendering's aspect is resampled.
     - Where a PNG or JPEG is white in a channel, the value is a lower bound, ``clipped``: such pixels are
       excluded, but for those that were neither painted nor clipped before. Black is no such limit: there is
       nothing below it.
-    - With alpha, colour counts as laid over the initial rendering; without that the colour is taken as it
-      is, and coverage is alpha.
+    - With alpha, colour counts as laid over the initial rendering; without that the colour is taken as it is,
+      and coverage is alpha.
 
-    Parameters
-    ----------
-    file : path-like
-        OpenEXR, Radiance, PNG or JPEG.
-    shape : tuple
-        (h, w) of the rendering.
-    tonemap_name : str
-        Declared tonemap, one of ``color.TONEMAPS``, or "auto".
-    initial : ndarray (h, w, 3), optional
-        Linear radiance of what was painted on. Without it every pixel counts as painted.
-    mask : path-like, optional
-        White where it was painted, in place of comparing; see :func:`read_mask`.
-    exported : mapping, optional
-        What an export of ``initial`` as a PNG says of itself (:func:`.initial_rendering.origin`): what the
-        file says is compared with it, and its tonemap is that of a file which says nothing.
+    ``initial`` (h, w, 3), linear radiance, is what was painted on; without it every pixel counts as painted.
+    A ``mask`` (:func:`read_mask`), white where it was painted, takes the place of comparing. ``exported`` is
+    what an export of ``initial`` as a PNG says of itself (:func:`.initial_rendering.origin`): what the file
+    says is compared with it, and its tonemap is that of a file which says nothing.
 
-    Raises
-    ------
-    InputError
-        If the file cannot be read, was exported from another rendering or under another tonemap than the
-        declared one, is of another aspect, holds values that are not finite, is grey where the rendering is
-        not, or shows nothing painted.
+    InputError if the file cannot be read, was exported from another rendering or under another tonemap than
+    the declared one, is of another aspect, holds values that are not finite, is grey where the rendering is
+    not, or shows nothing painted.
     """
     # ---- The file, and what it says of itself
     pixels, info = images.read_stored(file)
@@ -144,23 +130,11 @@ def read(
 
 
 def given(picture: np.ndarray, shape: Shape, initial: np.ndarray, mask: np.ndarray | None = None) -> Painted:
-    """Take a painted picture from arrays.
+    """Take a painted picture (h, w, 3), linear radiance, from arrays; negative values become 0.
 
-    Parameters
-    ----------
-    picture : array (h, w, 3)
-        Linear radiance; negative values become 0.
-    shape : tuple
-        (h, w) of the rendering.
-    initial : ndarray (h, w, 3)
-        What was painted on. Pixels that differ by less than a half float rounds were not painted.
-    mask : array (h, w) or (h, w, 1), optional
-        How much each pixel was painted, in [0, 1], in place of comparing.
-
-    Raises
-    ------
-    InputError
-        If the sizes differ, a value is not finite, or nothing is painted.
+    ``initial`` (h, w, 3), of ``shape`` (h, w), is what was painted on. Pixels that differ by less than a half
+    float rounds were not painted; a ``mask`` (h, w) or (h, w, 1), how much each was painted, in [0, 1], takes
+    the place of comparing. InputError if the sizes differ, a value is not finite, or nothing is painted.
     """
     picture = np.asarray(picture, np.float64)
     if picture.shape != (*shape, 3):
@@ -184,15 +158,10 @@ def given(picture: np.ndarray, shape: Shape, initial: np.ndarray, mask: np.ndarr
 
 
 def read_mask(file: FilePath, shape: Shape) -> np.ndarray:
-    """Read a mask as the weight of each pixel: white counts, black does not, greys in between.
+    """Read a mask as the weight of each pixel, (h, w, 1) float32: 1 of white, 0 of black, greys in between.
 
     Half grey is meant as a half, whatever curve the file has; transparent is black; float values are cut to
-    [0, 1]. Returns (h, w, 1) float32.
-
-    Raises
-    ------
-    InputError
-        If it cannot be read, is not (h, w), is not finite, or is black everywhere.
+    [0, 1]. InputError if it cannot be read, is not (h, w), is not finite, or is black everywhere.
     """
     pixels, info = images.read_stored(file)
     file, rows, columns = info["path"], *pixels.shape[:2]

@@ -51,12 +51,8 @@ def _nothing():
 class Camera:
     """Exposure, white balance and tone curve.
 
-    Attributes
-    ----------
-    curve : str
-        One of :data:`.TONE_CURVES`; "linear" of a file that holds linear radiance.
-    log_factor : ndarray (3,)
-        Natural logarithm of the factor of red, green and blue.
+    ``curve`` is one of :data:`.TONE_CURVES`, "linear" of a file that holds linear radiance; ``log_factor``
+    (3,) the natural logarithm of the factor of red, green and blue.
     """
 
     curve: str
@@ -86,48 +82,27 @@ class Camera:
 
 @dataclass(frozen=True)
 class Photo:
-    """A photograph on the film of the rendering.
+    """A photograph on the film of the rendering."""
 
-    Attributes
-    ----------
-    file : ndarray (H, W, 8)
-        Of the file, at most :data:`SUPERSAMPLED` times as wide as the film: linear radiance, which of its
-        values are clipped, what the lens lets through, and how much a pixel counts.
-    camera : Camera
-        As far as it is known.
-    curves : tuple of str
-        Curves that the camera may have.
-    placed : alignment.Placement
-        Where the film lies in the file's picture.
-    values : ndarray (h, w, 3)
-        On the film: display values in [0, 1], or linear radiance.
-    clipped : ndarray of bool (h, w, 3)
-        Values that say "at least so bright".
-    let_through : ndarray (h, w, 1)
-        v, the share of the light that the lens lets through beside that of the centre.
-    counts : ndarray (h, w, 1) float32
-        How much each pixel counts.
-    stops, kelvin : float or None
-        Exposure and white balance, where they are known.
-    aligns, recognised : bool
-        It may lie otherwise than as it is; its outlines are those of the scene.
-    settled : bool
-        Curve and placement have been compared under the light that was found.
-    """
-
+    # (H, W, 8), of the file, at most :data:`SUPERSAMPLED` times as wide as the film: linear radiance, which
+    # of its values are clipped, what the lens lets through, and how much a pixel counts
     file: np.ndarray
-    camera: Camera
-    curves: tuple[str, ...]
-    placed: alignment.Placement = alignment.Placement()
+    camera: Camera  # as far as it is known
+    curves: tuple[str, ...]  # that the camera may have
+    placed: alignment.Placement = alignment.Placement()  # where the film lies in the file's picture
+    # (h, w, 3), on the film: display values in [0, 1], or linear radiance
     values: np.ndarray = field(default_factory=_nothing)
+    # bool (h, w, 3), values that say "at least so bright"
     clipped: np.ndarray = field(default_factory=_nothing)
+    # (h, w, 1), v, the share of the light that the lens lets through beside that of the centre
     let_through: np.ndarray = field(default_factory=_nothing)
-    counts: np.ndarray = field(default_factory=_nothing)
+    counts: np.ndarray = field(default_factory=_nothing)  # (h, w, 1) float32, how much each pixel counts
+    # stops, kelvin: exposure and white balance, where they are known
     stops: float | None = None
     kelvin: float | None = None
-    aligns: bool = True
-    recognised: bool = False
-    settled: bool = False
+    aligns: bool = True  # it may lie otherwise than as it is
+    recognised: bool = False  # its outlines are those of the scene
+    settled: bool = False  # curve and placement have been compared under the light that was found
 
     def laid(self, shape: Shape, placed: alignment.Placement | None = None) -> Photo:
         """Return it on a film of shape (h, w, ...), or placed otherwise on it."""
@@ -253,32 +228,16 @@ def _balance(kelvin):
 def read(
     file: FilePath, mask: FilePath, outlines: np.ndarray, align: bool = True, vignetting: float = 0.0
 ) -> tuple[Photo, list[str]]:
-    """Read a photograph and lay it on the film of a rendering.
+    """Read a photograph and lay it on the film of a rendering; returns it, and warnings.
 
-    Parameters
-    ----------
-    file, mask : path-like
-        OpenEXR, Radiance, PNG or JPEG; "" for no mask, which is white where the photograph counts, and of the
-        photograph's size.
-    outlines : ndarray (h, w, 3)
-        The scene under light from everywhere, linear radiance.
-    align : bool
-        Find how it is shifted, scaled and rotated; otherwise it lies as it is.
-    vignetting : float
-        Stops by which its corners are darker than a lens without vignetting would make them: with r the
-        distance from the centre over that of the corners, v = 2^(-vignetting r^2).
+    ``file`` is OpenEXR, Radiance, PNG or JPEG, ``mask`` likewise, of the photograph's size and white where it
+    counts; "" for none. ``outlines`` (h, w, 3) is the scene under light from everywhere, linear radiance.
+    With ``align`` it is found how the photograph is shifted, scaled and rotated; otherwise it lies as it is.
+    By ``vignetting`` stops its corners are darker than a lens without would make them: with r the distance
+    from the centre over that of the corners, v = 2^(-vignetting r^2). Its camera changes nothing.
 
-    Returns
-    -------
-    Photo
-        With a camera that changes nothing.
-    list of str
-        Warnings.
-
-    Raises
-    ------
-    InputError
-        If a file cannot be read, is of another aspect, is not finite, or lies farther off than is looked for.
+    InputError if a file cannot be read, is of another aspect, is not finite, or lies farther off than is
+    looked for.
     """
     # ---- The file
     pixels, info = images.read_stored(file)

@@ -65,21 +65,11 @@ class Painted:
 
 
 def paint(picture: np.ndarray, strokes: Sequence[dict], tonemap: str = "gamma") -> Painted:
-    """Paint strokes on a picture, each on the result of those before it.
+    """Paint strokes on a picture (h, w, 3), finite linear radiance, each on the result of those before it.
 
-    Parameters
-    ----------
-    picture : array (h, w, 3)
-        Linear radiance, finite. Negative values are taken as black where a stroke works on display values.
-    strokes : sequence of dict
-        As in a configuration's ``target.strokes``.
-    tonemap : str
-        The display that erase-shadow, contrast and blur work on; one of :data:`envedit.core.color.TONEMAPS`.
-
-    Raises
-    ------
-    ConfigError
-        If a stroke or the tonemap cannot be understood.
+    Negative values are taken as black where a stroke works on display values. ``strokes`` are as in a
+    configuration's ``target.strokes``; erase-shadow, contrast and blur work on a display of this ``tonemap``,
+    one of :data:`envedit.core.color.TONEMAPS`. ConfigError if a stroke or the tonemap cannot be understood.
     """
     image = np.asarray(picture, np.float32)
     display = Display(tonemap)

@@ -116,30 +116,17 @@ def make(
     mask: np.ndarray | None = None,
     other: np.ndarray | None = None,
 ) -> Target:
-    """Make the target of a configuration.
+    """Make the target of a configuration: of its target, and of seed and repair of the input.
 
-    Parameters
-    ----------
-    settings : config.Config
-        What is wanted: its target, and seed and repair of the input.
-    scene : Scene
-        The scene that it is a picture of.
-    envmap : ndarray (H, W, 3)
-        The map that will be edited; turned by ``rotate_degrees`` where the target names no file.
-    picture : ndarray (h, w, 3), optional
-        A painted picture, linear radiance, in place of what the configuration names.
-    mask : ndarray (h, w), optional
-        How much each pixel of it was painted, in [0, 1]; None: seen by comparing with the initial rendering.
-    other : ndarray (H, 2 H, 3), optional
-        The map to render under, in place of ``file``, in the units of a file.
+    ``envmap`` (H, W, 3) is the map that will be edited; turned by ``rotate_degrees`` where the target names
+    no file. In place of what the configuration names may be given: a painted ``picture`` (h, w, 3), linear
+    radiance, and how much each pixel of it was painted, ``mask`` (h, w), in [0, 1], by default seen by
+    comparing with the initial rendering; or the ``other`` map (H, 2 H, 3) to render under, in the units of a
+    file.
 
-    Raises
-    ------
-    InputError
-        If a file cannot be read, a picture does not fit the film, or the other map is brighter than
-        :data:`.radiance.BRIGHTEST`. A picture that is so bright is cut there, with a warning.
-    ConfigError
-        If a view is not the scene's, or is given twice; as of :func:`.extensions.load`.
+    InputError if a file cannot be read, a picture does not fit the film, or the other map is brighter than
+    :data:`.radiance.BRIGHTEST`; a picture that is so bright is cut there, with a warning. ConfigError if a
+    view is not the scene's, or is given twice; as of :func:`.extensions.load`.
     """
     hidden = None if scene.alpha is None else scene.alpha == 0
     made = _made(settings, scene, envmap, picture, mask, other, hidden)

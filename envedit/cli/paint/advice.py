@@ -32,18 +32,10 @@ MOST_NAMED = 3
 
 @dataclass(frozen=True)
 class Light:
-    """What lights the pixels, (h, w, 3) each.
+    """Renderings (h, w, 3) of what lights the pixels."""
 
-    Attributes
-    ----------
-    white : ndarray
-        The rendering under a map of radiance 1, without lamps.
-    lamps : ndarray
-        That of the scene's lamps alone.
-    """
-
-    white: np.ndarray
-    lamps: np.ndarray
+    white: np.ndarray  # under a map of radiance 1, without lamps
+    lamps: np.ndarray  # of the scene's lamps alone
 
 
 @dataclass(frozen=True)
@@ -64,18 +56,8 @@ def said(
 ) -> tuple[str, list[Action]]:
     """Say which strokes are missed, why the worst is, and what can be done; "" if enough is reached.
 
-    Parameters
-    ----------
-    document : Document
-        What was painted, and how it is solved for.
-    request, rendering
-        What was asked for, and what was reached of it, (h, w, 3).
-    reach : Reach
-        What is feasible.
-    strokes : sequence of ndarray (h, w, 1)
-        Coverage of each stroke by itself.
-    light : Light
-        What lights the pixels.
+    Of what was asked for, ``request``, the ``rendering`` (h, w, 3) was reached, and ``reach`` is feasible.
+    ``strokes`` (h, w, 1) are the coverage of each stroke by itself.
     """
     shares = {
         i: request.of_stroke(rendering, cover)
@@ -146,23 +128,9 @@ def lights(
 ) -> list[Action]:
     """Find where the map's strongest light, or one more, would by itself reach more than a solution does.
 
-    Parameters
-    ----------
-    problem : Problem
-        Of the paint, where the rest follows: it does where a light is placed by hand.
-    start, state : dict
-        The map as it is, and the solution.
-    request : Request
-        What was asked for.
-    listed : list of Placed
-        The document's lights.
-    document : Document
-        Of which strokes are taken out.
-
-    Returns
-    -------
-    list of Action
-        That which reaches most first.
+    ``problem`` is of the paint, where the rest follows: it does where a light is placed by hand. ``start`` is
+    the map as it is, ``state`` the solution; ``listed`` are the lights of the document, of which strokes are
+    taken out. The action that reaches most comes first.
     """
     now = problem.evaluate(state, resolve=False).rendering
     if now is None:

@@ -89,16 +89,7 @@ def place(toward: np.ndarray, document: Document) -> dict[str, float]:
 class Picking:
     """Answers what was picked on the rendering.
 
-    Parameters
-    ----------
-    scene : Scene
-        What is seen.
-    placed : PlacedLights
-        The map as it was given.
-    transport : LightTransport
-        Of the scene.
-    rows : Rows
-        Of the map, which may change.
+    Of a scene, its transport, the map as it was given, and the rows of it that may change.
     """
 
     def __init__(self, scene: Scene, placed: PlacedLights, transport: LightTransport, rows: Rows):

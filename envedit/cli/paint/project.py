@@ -26,32 +26,16 @@ _RECENT = 12
 
 @dataclass(frozen=True)
 class Project:
-    """What is painted on, and where results go.
+    """What is painted on, and where results go."""
 
-    Attributes
-    ----------
-    settings : config.Config
-        Without what the document has: strokes, lights placed by hand, and how they are solved for.
-    folder : Path
-        Of the results and ``painted.toml``.
-    base : Path
-        Folder that file names in scene parameters are relative to.
-    document : Document
-        As it was left the last time.
-    again : bool
-        Whether ``painted.toml`` was there already.
-    start : str
-        File of the solution that was saved of the document, "" where it has changed since.
-    photo : config.Config, optional
-        The run that makes the map: it matches a photograph. None without one, and where it is done.
-    """
-
+    # Without what the document has: strokes, lights placed by hand, and how they are solved for
     settings: config.Config
-    folder: Path
-    base: Path
-    document: Document
-    again: bool = False
-    start: str = ""
+    folder: Path  # of the results and ``painted.toml``
+    base: Path  # what file names in scene parameters are relative to
+    document: Document  # as it was left the last time
+    again: bool = False  # whether ``painted.toml`` was there already
+    start: str = ""  # file of the solution that was saved of the document, "" where it has changed since
+    # The run that makes the map: it matches a photograph. None without one, and where it is done
     photo: config.Config | None = None
 
     def configured(self, document: Document, start: str = "") -> config.Config:
@@ -110,10 +94,7 @@ class Project:
     def alone(self) -> Iterator[None]:
         """Make the folder, and let no other server paint in it meanwhile.
 
-        Raises
-        ------
-        InputError
-            It cannot be made, or another server has it.
+        InputError if it cannot be made, or another server has it.
         """
         self._make_folder()
         with contextlib.ExitStack() as stack:
@@ -133,13 +114,7 @@ class Project:
             raise InputError(f"{self.folder}: cannot be made: {error.strerror or error}") from error
 
     def keep(self, document: Document, start: str = "") -> None:
-        """Write ``painted.toml``, whole or not at all; arguments as of :meth:`text`.
-
-        Raises
-        ------
-        InputError
-            It cannot be written.
-        """
+        """Write ``painted.toml``, whole or not at all; as of :meth:`text`; InputError if it cannot."""
         self._make_folder()
         atomic_files.write_atomically(self.folder / NAME, self.text(document, start).encode())
 
@@ -150,23 +125,11 @@ def _resolved(text, folder):
 
 
 def opened(name: str, envmap: str = "", preset: str | None = None, camera: str = "") -> Project:
-    """Open a configuration, a scene or what was painted before.
+    """Open a configuration, a scene or what was painted before: a file, or the name of a shipped one.
 
-    Parameters
-    ----------
-    name : str
-        A file, or the name of a shipped configuration or scene.
-    envmap : str
-        In place of the configuration's; "" for that.
-    preset : str, optional
-        In place of the configuration's.
-    camera : str
-        Id of the sensor, of a USD file its path; "": the configuration's.
-
-    Raises
-    ------
-    ConfigError
-        As of :func:`.schema.load`; also for a target that is no paint, where the configuration says so.
+    ``envmap``, ``preset`` and ``camera``, the id of a sensor, of a USD file its path, take the place of the
+    configuration's. ConfigError as of :func:`.schema.load`; also for a target that is no paint, where the
+    configuration says so.
     """
     overrides = [f"input.envmap={config.quote(_path(envmap))}"] if envmap else []
     overrides += [f"scene.sensors={config.quote([camera])}"] if camera else []

@@ -53,20 +53,9 @@ class BadMessageError(ValueError):
 class Document:
     """What a user has done: all that is saved.
 
-    Attributes
-    ----------
-    strokes : tuple of dict
-        As in ``[[target.strokes]]``.
-    lights, regions : tuple of dict
-        As in ``[[input.lights]]`` and ``[[input.regions]]``.
-    rotate_degrees, tilt_degrees, horizon_degrees : float
-        As in ``[input]``.
-    exposure, temperature : float
-        As in ``[output]``.
-    rest : str
-        ``[target] rest``.
-    freedom : float
-        ``[solve] freedom``.
+    ``strokes``, ``lights`` and ``regions`` are as in ``[[target.strokes]]``, ``[[input.lights]]`` and
+    ``[[input.regions]]``, angles as in ``[input]``, ``exposure`` and ``temperature`` as in ``[output]``;
+    ``rest`` is of ``[target]``, ``freedom`` of ``[solve]``.
     """
 
     strokes: tuple[dict, ...] = ()
@@ -216,10 +205,7 @@ class Save:
 def read(text: str | bytes, client: str = "") -> Edit | Pick | Choose | Open | ApplyLook | Sky | Save:
     """Read a message from the page.
 
-    Raises
-    ------
-    BadMessageError
-        It is not JSON, of no known type, or has unusable values.
+    BadMessageError if it is not JSON, of no known type, or has unusable values.
     """
     if isinstance(text, bytes) or len(text) > MOST_BYTES:
         raise BadMessageError(f"got {len(text)} bytes, expected JSON text of at most {MOST_BYTES}")

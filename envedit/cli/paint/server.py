@@ -125,19 +125,8 @@ class Hub(Tell):
 class Server:
     """Page, worker and what lies between them.
 
-    Parameters
-    ----------
-    opened : Project, optional
-        What is painted on; None: the start page.
-    port : int
-        0: any that is free.
-    token : str, optional
-        Part of every address; None: a random one.
-
-    Raises
-    ------
-    OSError
-        The port is in use.
+    ``opened`` is what is painted on; None: the start page. With port 0 any that is free is taken. ``token``
+    is part of every address; None: a random one. OSError if the port is in use.
     """
 
     def __init__(self, opened: project.Project | None = None, port: int = 0, token: str | None = None):

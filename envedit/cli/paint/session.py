@@ -90,17 +90,7 @@ def give_back_memory() -> None:
 
 
 class Session:
-    """A painting that is open.
-
-    Parameters
-    ----------
-    project : Project
-        What is painted on.
-    tell : Tell
-        Receives frames and progress.
-    newer : callable
-        Whether something newer waits.
-    """
+    """A painting that is open; ``tell`` receives frames and progress, ``newer`` asks if an edit waits."""
 
     def __init__(self, project: Project, tell: Tell, newer: Callable[[], bool] = lambda: False):
         self.project, self.tell = project, tell

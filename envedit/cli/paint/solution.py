@@ -38,12 +38,8 @@ COLUMNS = 32
 class Request:
     """What was painted.
 
-    Attributes
-    ----------
-    base, target : ndarray (h, w, 3)
-        What was painted on, and what was asked for, linear radiance.
-    coverage : ndarray (h, w, 1)
-        How much each pixel was painted; 0 of those that do not count.
+    ``base`` and ``target`` (h, w, 3), linear radiance, are what was painted on, and what was asked for;
+    ``coverage`` (h, w, 1) is how much each pixel was painted, 0 of those that do not count.
     """
 
     base: np.ndarray
@@ -65,35 +61,14 @@ class Request:
 class Solution:
     """What is painted on, what is painted, and the solution.
 
-    Parameters
-    ----------
-    settings : Config
-        Of the project.
-    scene : Scene
-        At the size at which edits are solved.
-    placed : PlacedLights
-        The map's lights, placed by hand.
-    transport : LightTransport
-        T.
-    rows : Rows
-        Active rows.
+    ``settings`` are of the project, ``scene`` is at the size at which edits are solved, ``placed`` are the
+    map's lights, placed by hand, ``transport`` is T, ``rows`` may change.
 
-    Attributes
-    ----------
-    origin, base : ndarray (H, W, 3), (h, w, 3)
-        The map that is painted on, and its rendering T E_0.
-    kept : ndarray (H, W) or None
-        How far texels of it stay as they are.
-    target, coverage : ndarray (h, w, 3), (h, w, 1)
-        The painted picture, and how much each pixel was painted; without paint the base, and None.
-    still : dict
-        The state of the map as it is.
-    run, point
-        The solution.
-    searched : bool
-        Whether other lights were looked for.
-    explanations : list of Explanation
-        Of the paint; the one of index ``chosen`` is gone on with.
+    ``origin`` (H, W, 3) is the map that is painted on, ``base`` (h, w, 3) its rendering T E_0, and ``kept``
+    (H, W) how far texels of it stay as they are, or None. ``target`` (h, w, 3) is the painted picture, and
+    ``coverage`` (h, w, 1) how much each pixel was painted; without paint the base, and None. ``still`` is the
+    state of the map as it is, ``run`` and ``point`` are the solution. ``searched`` says whether other lights
+    were looked for; of the ``explanations`` of the paint, the one of index ``chosen`` is gone on with.
     """
 
     def __init__(

@@ -31,15 +31,7 @@ class Again:
 
 
 class Worker(threading.Thread):
-    """Carries requests out, one at a time, and what goes on between them.
-
-    Parameters
-    ----------
-    tell : Tell
-        Receives every message.
-    opened : Project, optional
-        What to begin with.
-    """
+    """Carries requests out, one at a time, and what goes on between them; ``tell`` receives every message."""
 
     def __init__(self, tell: Tell, opened: project.Project | None = None):
         super().__init__(name="envedit-paint", daemon=True)

@@ -19,8 +19,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 
 from envedit.core import latlong
@@ -53,7 +51,7 @@ def degrees_to_cores(lights: list[Light], shape: tuple[int, int], rows: tuple[in
 
     A core is taken to be a disc of the solid angle of its texels. ``rows`` is as of :func:`behind_glow`.
     """
-    (first, total) = rows
+    first, total = rows
     width = shape[1]
     toward = latlong.directions(total, width)[first : first + shape[0]]
     omega = latlong.lookup_solid_angles(total, width)
@@ -63,11 +61,6 @@ def degrees_to_cores(lights: list[Light], shape: tuple[int, int], rows: tuple[in
         return np.full(shape, 180.0)
     angles = np.arccos(np.clip(toward @ np.transpose([light.direction for light in glowing]), -1, 1))
     return np.degrees(np.maximum(angles - radii, 0).min(axis=2))
-
-
-def gone_of(ratio: mi.Color3f) -> mi.Float:
-    """Return the share of radiance that was a glow's and is gone, where the glow changes by a ratio."""
-    return dr.maximum(mi.luminance(1 - ratio), 0)
 
 
 def near_core(away: np.ndarray) -> np.ndarray:

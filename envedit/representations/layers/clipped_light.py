@@ -87,14 +87,12 @@ class ClippedLight:
         measured = np.flatnonzero(np.isfinite(profile))
         if len(measured) < 3 or not profile[measured].min() > 0:
             return 0.0, 0.0
-        first = measured[0]
-        last = measured[2]
+        first, last = measured[[0, 2]]
         octaves = np.log2(RING_DEGREES[last] / RING_DEGREES[first])
         darkest = (1 - 1e-6) * profile[measured].min()
         over = (profile[first] - darkest) / (profile[last] - darkest)
-        return float(np.log2(profile[first] / profile[last]) / octaves), float(
-            np.log2(max(over, 1e-6)) / octaves
-        )
+        falls = np.log2([profile[first] / profile[last], max(over, 1e-6)]) / octaves
+        return float(falls[0]), float(falls[1])
 
     @property
     def has_aureole(self) -> bool:

@@ -23,7 +23,6 @@ import drjit as dr
 import mitsuba as mi
 
 from envedit.core.arrays import settled
-from envedit.representations.layers.behind_glow import gone_of
 from envedit.representations.layers.gain import brightened
 from envedit.representations.layers.lights import Lights
 from envedit.representations.layers.saturation import saturated
@@ -84,7 +83,7 @@ def compose(base: mi.Color3f, directions: mi.Vector3f | None, fields: Fields) ->
         glow = glows.lights.glow(glows.turn, glows.log_flux, directions)
         glow = glow if fields.log_glow is None else glow * dr.exp(fields.log_glow)
         factor = settled(glow / glows.before, 1)  # exactly 1 where nothing moved
-        gone = gone_of(factor)
+        gone = dr.maximum(mi.luminance(1 - factor), 0)
         hidden = glows.offset + glows.slope * dr.log(base / glows.before + glows.faint)
         added = (factor - 1) * dr.exp(dr.minimum(mi.luminance(hidden), 0))
         factor = dr.select(factor > 1, 1 + added, factor)

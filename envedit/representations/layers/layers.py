@@ -334,13 +334,17 @@ class Layers:
 
     def gain_slope(self, params: dict) -> np.ndarray:
         """Return the derivative of the sky by the log gain of a texel, (rows, W, 3), above the horizon."""
-        real = self._real(params)
+        return self._slope_by("log_gain", self._real(params))
+
+    def _slope_by(self, name, real):
+        """Return the derivative of the sky by a field of :class:`.Fields`, 0 where it is None."""
         with dr.isolate_grad():
             fields = self._fields(real)
-            log_gain = mi.Color3f(fields.log_gain)
-            dr.enable_grad(log_gain)
-            dr.set_grad(log_gain, 1)
-            sky = self._above(real, replace(fields, log_gain=log_gain)).sky
+            value = getattr(fields, name)
+            value = dr.zeros(mi.Color3f, math.prod(self.shape)) if value is None else mi.Color3f(value)
+            dr.enable_grad(value)
+            dr.set_grad(value, 1)
+            sky = self._above(real, replace(fields, **{name: value})).sky
             dr.forward_to(sky)
             return self._image(dr.grad(sky)).numpy()
 
@@ -350,14 +354,7 @@ class Layers:
         ``sky`` is that map; there are glows. Rows that follow change by as much, relatively, as what they
         mirror, fading.
         """
-        real = self._real(params)
-        with dr.isolate_grad():
-            log_glow = dr.zeros(mi.Color3f, math.prod(self.shape))
-            dr.enable_grad(log_glow)
-            dr.set_grad(log_glow, 1)
-            above = self._above(real, replace(self._fields(real), log_glow=log_glow)).sky
-            dr.forward_to(above)
-            slope = self._image(dr.grad(above)).numpy()
+        slope = self._slope_by("log_glow", self._real(params))
         if self.below is None:
             return slope
         up = len(slope)

@@ -98,25 +98,20 @@ class PlacedLights:
             return tuple(placed)
         named = {light["light"] for light in placed if "light" in light}
         own = [{"light": i + 1, "flux": [1.0] * 3, "size": 1.0} for i in range(len(self.lights))]
-        locked = []
-        for light in (*placed, *(light for light in own if light["light"] not in named)):
-            at = self._toward(light)
-            inside = False
-            if at is not None:
-                row, column = (round(float(v)) for v in latlong.texel_position(at, *kept.shape))
-                inside = kept[row, column % kept.shape[1]] >= map_regions.KEPT_SHARE
-            if inside:
-                locked.append(light | {"locked": True})
-            elif light in placed:
-                locked.append(light)
-        return tuple(locked)
+        unnamed = [light for light in own if light["light"] not in named and self._stands_in(kept, light)]
+        given = [light | {"locked": True} if self._stands_in(kept, light) else light for light in placed]
+        return (*given, *(light | {"locked": True} for light in unnamed))
 
-    def _toward(self, light):
-        """Return where the light of an entry stands, (3,); None where the map does not have it."""
+    def _stands_in(self, kept, light):
+        """Return whether the light of an entry stands where the map is kept; it may not have that light."""
         if "azimuth" in light:
-            return direction(light["azimuth"], light["elevation"])
-        known = light["light"] <= len(self.lights)
-        return self.lights[light["light"] - 1].direction if known else None
+            toward = direction(light["azimuth"], light["elevation"])
+        elif light["light"] <= len(self.lights):
+            toward = self.lights[light["light"] - 1].direction
+        else:
+            return False
+        row, column = (round(float(v)) for v in latlong.texel_position(toward, *kept.shape))
+        return kept[row, column % kept.shape[1]] >= map_regions.KEPT_SHARE
 
     def by_hand(self, placed: Sequence[dict], regions: Sequence[dict]) -> ByHand:
         """Place lights, then change regions; a light in a region that is kept is locked.

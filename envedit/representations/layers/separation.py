@@ -150,22 +150,16 @@ def separate(
     background = np.where(inside, (image - core) / glow, image / glow)
 
     # ---- Lights; those that leave nothing at this resolution are dropped
-    lights: list[Light] = []
-    kept: list[int] = []
+    shining = (core > 0).any(axis=2)
+    texels = [np.flatnonzero((label == i) & shining) for i in range(len(survey.centres))]
+    kept = [i for i, some in enumerate(texels) if len(some)]
     number = np.full(len(survey.centres) + 1, -1)  # the last for texels of no light
-    for i, centre in enumerate(survey.centres):
-        texels = np.flatnonzero((label == i).ravel() & (core > 0).any(axis=2).ravel())
-        if not len(texels):
-            continue
-        number[i] = len(lights)
-        kept.append(i)
-        lights.append(Light(centre, texels, core.reshape(-1, 3)[texels], survey.glows[i]))
-    survey = replace(
-        survey,
-        label=number[survey.label],
-        centres=[survey.centres[i] for i in kept],
-        glows=[survey.glows[i] for i in kept],
-    )
+    number[kept] = np.arange(len(kept))
+    centres = [survey.centres[i] for i in kept]
+    glows = [survey.glows[i] for i in kept]
+    radiance = [core.reshape(-1, 3)[texels[i]] for i in kept]
+    lights = [Light(centres[k], texels[i], radiance[k], glows[k]) for k, i in enumerate(kept)]
+    survey = replace(survey, label=number[survey.label], centres=centres, glows=glows)
     return Separation(background, glow, core, lights, survey)
 
 
@@ -265,24 +259,27 @@ class _Places:
 def _reduced(image, first, total):
     """Copy an image at no more than the width of detection."""
     height, width = image.shape[:2]
+    h, w, start, stop = total, width, first, first + height
+    small = np.asarray(image, np.float64)
     if width > DETECT_WIDTH:
         h, w = max(round(total * DETECT_WIDTH / width), 3), DETECT_WIDTH
         start = min(round(first * h / total), h - 1)
         stop = max(round((first + height) * h / total), start + 1)
-        whole = np.zeros((total, width, 4), np.float32)
-        whole[first : first + height, :, :3] = image
-        whole[first : first + height, :, 3] = 1
-        whole = latlong.resize(whole, h, w).astype(np.float64)[start:stop]
-        small = whole[..., :3] / np.maximum(whole[..., 3:], 1e-6)
-    else:
-        small = np.asarray(image, np.float64)
-        h = total
-        w = width
-        start = first
-        stop = first + height
+        sums, known = _resized(image, first, total, (h, w))
+        small = sums[start:stop] / np.maximum(known[start:stop], 1e-6)
     toward = latlong.directions(h, w)[start:stop]
     omega = np.repeat(latlong.solid_angles(h, w)[start:stop, None], w, axis=1)
     return _Small(small, toward, omega, first, total, (start, h))
+
+
+def _resized(image, first, total, shape):
+    """Resize a map of which some rows are known, 0 elsewhere: (h, w, n), and the known share (h, w, 1)."""
+    height, width, channels = image.shape
+    whole = np.zeros((total, width, channels + 1), np.float32)
+    whole[first : first + height, :, :-1] = image
+    whole[first : first + height, :, -1] = 1
+    small = latlong.resize(whole, *shape).astype(np.float64)
+    return small[..., :-1], small[..., -1:]
 
 
 def _find(small: _Small, most: int) -> tuple[np.ndarray, int]:
@@ -327,17 +324,12 @@ def coarse(
     Returns rows and columns of the coarse map, which of its texels are known, (h * w,) bool, and of those the
     luminance and the known part of the solid angle.
     """
-    height, width = lum.shape
-    w = min(COARSE_COLUMNS, width)
+    w = min(COARSE_COLUMNS, lum.shape[1])
     h = max(w // 2, 3)
-    whole = np.zeros((total, width, 2), np.float32)
-    whole[first : first + height, :, 0] = lum
-    whole[first : first + height, :, 1] = 1
-    small = latlong.resize(whole, h, w).astype(np.float64).reshape(-1, 2)
-    known = small[:, 1] > 1e-6
-    value = small[known, 0] / small[known, 1]
-    weight = np.repeat(latlong.solid_angles(h, w), w)[known] * small[known, 1]
-    return (h, w), known, value, weight
+    sums, share = (small.ravel() for small in _resized(lum[..., None], first, total, (h, w)))
+    known = share > 1e-6
+    weight = np.repeat(latlong.solid_angles(h, w), w)[known] * share[known]
+    return (h, w), known, sums[known] / share[known], weight
 
 
 def _local_median(lum, first, total):
@@ -369,9 +361,7 @@ def _neighbours(values, outside):
 
 def _grown(mask):
     """Add every neighbour of a mask."""
-    for shifted in list(_neighbours(mask, False)):
-        mask = mask | shifted
-    return mask
+    return np.logical_or.reduce([mask, *_neighbours(mask, False)])
 
 
 def grown(label: np.ndarray) -> np.ndarray:
@@ -385,9 +375,7 @@ def components(mask: np.ndarray) -> np.ndarray:
     far = mask.size
     label = np.where(mask, np.arange(far).reshape(mask.shape), far)
     while True:
-        least = label
-        for shifted in _neighbours(label, far):
-            least = np.minimum(least, shifted)
+        least = np.minimum.reduce([label, *_neighbours(label, far)])
         least = np.where(mask, least, far)
         if np.array_equal(least, label):
             return np.where(mask, label, -1)
@@ -565,11 +553,13 @@ def _membrane(values, mask):
 
     # ---- Means of known texels, half as fine, filled likewise
     known = (~mask).astype(np.float64)[..., None]
-    rows = height + height % 2
-    columns = width + width % 2
-    pad = ((0, rows - height), (0, columns - width), (0, 0))
-    weight = np.pad(known, pad).reshape(rows // 2, 2, columns // 2, 2, 1).sum(axis=(1, 3))
-    total = np.pad(values * known, pad).reshape(rows // 2, 2, columns // 2, 2, -1).sum(axis=(1, 3))
+
+    def of_four(image):
+        padded = np.pad(image, ((0, height % 2), (0, width % 2), (0, 0)))
+        rows, columns, channels = padded.shape
+        return padded.reshape(rows // 2, 2, columns // 2, 2, channels).sum(axis=(1, 3))
+
+    weight, total = of_four(known), of_four(values * known)
     coarse = _membrane(total / np.maximum(weight, 1), weight[..., 0] == 0)
     guess = coarse.repeat(2, axis=0).repeat(2, axis=1)[:height, :width]
 

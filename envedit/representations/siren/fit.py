@@ -207,7 +207,8 @@ class Perturbation:
     """
 
     def __init__(self, params: siren.Params, gamma: float):
-        self.gamma, self.names = gamma, siren.weight_names(params)
+        self.gamma = gamma
+        self.names = [name for name in params if name.endswith(".weight")]
         self._zeros = {name: dr.opaque(dr.zeros(mi.TensorXf, params[name].shape)) for name in self.names}
         self._direction: siren.Params | None = None
 
@@ -223,9 +224,8 @@ class Perturbation:
         out = dict(params)
         for name in self.names:
             d = self._direction[name]
-            length = dr.sqrt(dr.sum(dr.square(params[name].array))) * dr.rcp(
-                dr.sqrt(dr.sum(dr.square(d.array))) + 1e-20
-            )
+            norm, norm_of_d = (dr.sqrt(dr.sum(dr.square(x.array))) for x in (params[name], d))
+            length = norm * dr.rcp(norm_of_d + 1e-20)
             out[name] = params[name] + mi.TensorXf(self.gamma * length * d.array, d.shape)
         dr.eval(out)
         return out

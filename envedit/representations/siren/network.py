@@ -59,11 +59,6 @@ def layers(params: Params) -> int:
     return len(params) // 2
 
 
-def weight_names(params: Params) -> list[str]:
-    """List the weight matrices, first layer first; what adversarial perturbation acts on."""
-    return [f"{i}.weight" for i in range(layers(params))]
-
-
 def coordinates(height: int, width: int) -> mi.TensorXf:
     """Texel centres as network coordinates (H * W, 2), columns (y, x) in (-1, 1), row-major over texels.
 

@@ -72,10 +72,8 @@ class Document:
     @property
     def placing(self) -> tuple:
         """What decides what the map is before paint: not the names, roles and order of its lights."""
-        lights = [
-            {key: value for key, value in light.items() if key not in ("name", "role")}
-            for light in self.lights
-        ]
+        unplaced = "name", "role"
+        lights = [{k: v for k, v in light.items() if k not in unplaced} for light in self.lights]
         changed = [light for light in lights if light != unchanged(light.get("light"))]
         placed = sorted(json.dumps(light, sort_keys=True) for light in changed)
         return placed, self.regions, self.orientation

@@ -206,7 +206,7 @@ class Server:
         if not self._known(request):
             return PlainTextResponse("the address lacks its token", 403, _SAFE)
         session, name = self.worker.session, request.path_params["name"]
-        file = session.project.folder / name if session is not None else None
+        file = None if session is None else session.project.folder / name
         if file is None or name not in output_folder.RESULTS or not file.is_file() or file.is_symlink():
             return PlainTextResponse("no such result", 404, _SAFE)
         # The report has its pictures and its style in itself.
@@ -255,7 +255,7 @@ class Server:
                     part.unlink(missing_ok=True)
 
     async def _socket(self, socket: WebSocket) -> None:
-        if not self._known(socket) or socket.headers.get("origin") not in self.origins:
+        if not self._from_page(socket):
             await socket.close(4403)  # before it is accepted: HTTP 403
             return
         if len(self.hub.clients) >= MOST_CLIENTS:

@@ -102,12 +102,7 @@ class Session:
         self.document, self.resting, self.phase = Document(), False, "done"
         self._rendered: tuple[int, Any] | None = None  # passes and their sum
         self._shown: np.ndarray | None = None  # the rendering by T that the pages show
-        self.status: dict[str, Any] = {
-            "iterations": 0,
-            "steps": 0,
-            "number": 0,
-            "client": "",
-        }
+        self.status: dict[str, Any] = {"iterations": 0, "steps": 0, "number": 0, "client": ""}
         settings = project.settings
         if project.photo:
             self._match(project.photo)
@@ -521,15 +516,8 @@ class Session:
             azimuth, elevation = angles(light.direction)
             flux = self.placed.layers.lights.flux[i].tolist()
             radius = math.degrees(math.sqrt(omega[light.texels // width].sum() / math.pi))
-            own.append(
-                {
-                    "light": i + 1,
-                    "azimuth": azimuth,
-                    "elevation": elevation,
-                    "flux": flux,
-                    "radius": radius,
-                }
-            )
+            there = {"light": i + 1, "azimuth": azimuth, "elevation": elevation}
+            own.append(there | {"flux": flux, "radius": radius})
         found = []
         problem, state = self.solution.problem, self.solution.run.state
         for i in problem.shining(state):
@@ -621,9 +609,11 @@ class Session:
 
         # ---- The run that goes on from it
         settings = installed.settled(project.configured(self.document, start))
-        result, warnings = self._carried_out(
-            settings, folder, lambda text: self.tell.say({"type": "saving", "text": text}), import_s
-        )
+
+        def stage(text):
+            self.tell.say({"type": "saving", "text": text})
+
+        result, warnings = self._carried_out(settings, folder, stage, import_s)
 
         # ---- What was saved, no less sharp than what is shown, and how it differs
         saved, rows = result.maps["edited"], tuple(view.rows for view in result.views)
@@ -656,9 +646,11 @@ class Session:
     def _match(self, settings):
         """Find the light of a photograph; its map is painted on, at the resolution of the input's file."""
         folder = Path(settings.output.dir)
-        self._carried_out(
-            installed.settled(settings), folder, lambda text: self._stage(f"matching the photograph: {text}")
-        )
+
+        def stage(text):
+            self._stage(f"matching the photograph: {text}")
+
+        self._carried_out(installed.settled(settings), folder, stage)
         full = folder / "edited_full.exr"
         shutil.copyfile(full if full.exists() else folder / "edited.exr", folder / MATCHED)
 

@@ -106,9 +106,8 @@ class Solution:
         self.transport.resolve(self.origin, limit=COLUMNS)
         self.base = self.transport.apply(tensor(self.origin)).numpy()
         self.problem = map_problem.Problem(layers, self.transport, self.origin, self.base)
-        self.still = self.start = self.problem.state(layers.start())
-        self.run = gauss_newton.Run(self.start, self.start)
-        self.point = self.problem.evaluate(self.run.state, resolve=False)
+        self.still = self.problem.state(layers.start())
+        self._start_anew()
         self._painted: tuple[list, strokes.Painted] | None = None
         self.paint(document)
 
@@ -123,13 +122,17 @@ class Solution:
         coverage = None if painted is None else np.where(self._hidden[..., None], 0, painted.coverage)
         self.solving = bool(coverage is not None and coverage.any())
         if not self.solving:
-            self.start = self.still
-            self.run = gauss_newton.Run(self.start, self.start)
-            self.point = self.problem.evaluate(self.start, resolve=False)
+            self._start_anew()
             self.target, self.coverage = self.base, None
             return
         self.target, self.coverage = painted.picture, coverage
         self._weigh()
+
+    def _start_anew(self):
+        """Go back to the map as it is."""
+        self.start = self.still
+        self.run = gauss_newton.Run(self.start, self.start)
+        self.point = self.problem.evaluate(self.start, resolve=False)
 
     @property
     def asked_settings(self) -> config.Config:

@@ -150,11 +150,7 @@ class Photo:
 
     def under(self, curve: str, rendering: np.ndarray, weight: np.ndarray | None) -> Photo:
         """Return it with another curve, and the factor at which a rendering is nearest in the median."""
-        camera = Camera(curve)
-        return replace(self, camera=replace(camera, log_factor=self._factor(camera, rendering, weight)))
-
-    def _factor(self, camera, rendering, weight):
-        exposed = camera.radiance(self.values) / self.let_through
+        exposed = Camera(curve).radiance(self.values) / self.let_through
         telling = ~self.clipped & (self.values > DARKEST) & (rendering > 0) & (exposed > 0)
         if weight is not None:
             telling &= weight > 0
@@ -171,7 +167,7 @@ class Photo:
         along = AXES @ (factor - self.centre)
         along[:1] *= self.stops is None
         along[1:] *= self.kelvin is None
-        return self.centre + along @ AXES
+        return replace(self, camera=Camera(curve, self.centre + along @ AXES))
 
     @property
     def measures(self) -> dict:

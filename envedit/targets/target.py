@@ -161,10 +161,10 @@ def _made(settings, scene, envmap, picture, mask, other, hidden):
     asked: tuple[np.ndarray, ...] = ()
     if picture is not None:
         painted = painted_image.given(picture, (scene.height, scene.width), initial, mask)
-        source, asked = "painted: given as an array", (picture, *([] if mask is None else [mask]))
+        source, asked = "painted: given as an array", _given(picture, mask)
     elif chosen.kind == "image":
         painted = _painted_files(scene, initial, settings)
-        asked = tuple(np.fromfile(file, np.uint8) for file in (*chosen.files, *chosen.masks) if file)
+        asked = _bytes_of_files(chosen)
         source = f"painted: {', '.join(chosen.files)}"
     else:
         painted = _painted_strokes(scene, initial, chosen)
@@ -199,6 +199,15 @@ def _made(settings, scene, envmap, picture, mask, other, hidden):
     return Target(picture, weight, None, source, warnings, initial, coverage, asked)
 
 
+def _given(picture, mask):
+    return (picture,) if mask is None else (picture, mask)
+
+
+def _bytes_of_files(chosen):
+    """Return what pictures and masks of a [target] hold, each a file."""
+    return tuple(np.fromfile(file, np.uint8) for file in (*chosen.files, *chosen.masks) if file)
+
+
 def _of_rendering(settings, scene, envmap, picture, mask, how=""):
     """Take a picture of the scene under other light; ``how``: why it is taken for one."""
     # ---- The picture
@@ -207,11 +216,10 @@ def _of_rendering(settings, scene, envmap, picture, mask, how=""):
         everywhere = np.ones(shape) if mask is None else mask
         image = painted_image.given(picture, shape, np.zeros((*shape, 3)), everywhere)
         source = "a picture of the scene, given as an array"
-        asked = (picture, *([] if mask is None else [mask]))
+        asked = _given(picture, mask)
     else:
         unnamed = {"tonemap": "srgb"}
-        files = zip(chosen.files, chosen.masks or ("",) * len(chosen.files), strict=True)
-        by_view = _by_view(scene, chosen.views, files)
+        by_view = _files_by_view(scene, chosen)
 
         def of_view(k, before):
             file, mask = by_view[k]
@@ -219,7 +227,7 @@ def _of_rendering(settings, scene, envmap, picture, mask, how=""):
 
         image = _of_views(scene, np.zeros((*shape, 3), np.float32), by_view, of_view)
         source = f"a picture of the scene: {', '.join(chosen.files)}"
-        asked = tuple(np.fromfile(file, np.uint8) for file in (*chosen.files, *chosen.masks) if file)
+        asked = _bytes_of_files(chosen)
 
     # ---- Pixels that count, and its noise
     if not ((image.coverage[..., 0] > 0) & ~image.excluded).any():
@@ -253,7 +261,7 @@ def _of_photo(settings, scene, envmap, picture, mask):
     known = [None if value == "auto" else value for value in (chosen.exposure, chosen.white_balance)]
     photo = replace(photo, curves=curves, stops=known[0], kelvin=known[1])
     photo = photo.under(curves[0], initial, photo.counts)
-    asked = tuple(np.fromfile(one, np.uint8) for one in (*chosen.files, *chosen.masks) if one)
+    asked = _bytes_of_files(chosen)
     placed = f", {photo.placed.summary}" if photo.placed.summary else ""
     source = f"a photograph of the scene: {file}{placed}"
     counts = None if (photo.counts == 1).all() else photo.counts
@@ -274,11 +282,16 @@ def _by_view(scene, views, values):
     return dict(zip(numbers, values, strict=True))
 
 
+def _files_by_view(scene, chosen):
+    """Return picture and mask, "" without one, for each view that has them."""
+    masks = chosen.masks or ("",) * len(chosen.files)
+    return _by_view(scene, chosen.views, zip(chosen.files, masks, strict=True))
+
+
 def _painted_files(scene, initial, settings):
     """Read what was painted on views, each from its file."""
     chosen, name = settings.target, initial_rendering.png_tonemap(initial, settings)
-    masks = chosen.masks or ("",) * len(chosen.files)
-    painted = _by_view(scene, chosen.views, zip(chosen.files, masks, strict=True))
+    painted = _files_by_view(scene, chosen)
 
     def of_view(k, before):
         file, mask = painted[k]

@@ -223,7 +223,7 @@ class LightTransport:
         self.forward = ColourMatrix(rows, columns, weights, (pixels, texels))
         self.reverse = ColourMatrix(columns, rows, weights, (texels, pixels))
         influence = np.bincount(columns, weights.astype(np.float64).mean(axis=1), minlength=texels)
-        self.influence = influence.reshape(self.grid.height, self.grid.width).astype(np.float32)
+        self.influence = influence.reshape(self.grid.shape).astype(np.float32)
 
     def _recording(self):
         """Return the first recording as arrays, for :meth:`_take`."""
@@ -237,10 +237,9 @@ class LightTransport:
 
     def _whole(self, arrays):
         """Return whether :meth:`_take` can take arrays from disk."""
-        grid = (self.grid.height, self.grid.width)
         pixels = self.shape[0] * self.shape[1]
         own = {k: a for k, a in arrays.items() if "/" not in k}
-        kept = {"influence": ("f4", grid), "lost": ("i8", ()), "offset": ("f4", (None,))}
+        kept = {"influence": ("f4", self.grid.shape), "lost": ("i8", ()), "offset": ("f4", (None,))}
         shapes = {"forward": (pixels, self.grid.texels), "reverse": (self.grid.texels, pixels)}
         return (
             holds(own, kept)
@@ -309,11 +308,10 @@ class LightTransport:
         """Return T between blocks of pixels and cells of texels; summed up once and kept on disk."""
         if self._overview is None:
             cache, key = self._stored
-            grid = (self.grid.height, self.grid.width)
-            views = self.scene.rows
-            stored = cache.load(key, lambda arrays: overviews.whole(arrays, self.shape, grid, views))
+            sizes = self.shape, self.grid.shape, self.scene.rows
+            stored = cache.load(key, lambda arrays: overviews.whole(arrays, *sizes))
             if stored is None:
-                stored = vars(overviews.make(self.forward, self.shape, grid, views))
+                stored = vars(overviews.make(self.forward, *sizes))
                 cache.store(key, stored)
             self._overview = overviews.Overview(**{k: np.array(v) for k, v in stored.items()})
         return self._overview
@@ -347,7 +345,7 @@ class LightTransport:
             The map has another shape.
         """
         envmap = tensor(envmap) if isinstance(envmap, np.ndarray) else envmap
-        _check(envmap, (self.grid.height, self.grid.width, 3), "map")
+        _check(envmap, (*self.grid.shape, 3), "map")
         return dr.custom(_Apply, self, envmap)
 
     def linear(self, maps: mi.TensorXf) -> mi.TensorXf:
@@ -357,7 +355,7 @@ class LightTransport:
         work than one. Returns (h, w, 3), or (k, h, w, 3).
         """
         many = maps.shape[0] if maps.ndim == 4 else 1
-        _check(maps, (*maps.shape[:-3], self.grid.height, self.grid.width, 3), "map")
+        _check(maps, (*maps.shape[:-3], *self.grid.shape, 3), "map")
         return mi.TensorXf(self._products(maps, many), (*maps.shape[:-3], *self.shape, 3))
 
     def other_light(self) -> np.ndarray:
@@ -485,7 +483,7 @@ class LightTransport:
         coarse *= self._exact.mask
         flat = dr.ravel(coarse)
         self._exact.add_adjoint(flat, packets)
-        return mi.TensorXf(flat, (self.grid.height, self.grid.width, 3))
+        return mi.TensorXf(flat, (*self.grid.shape, 3))
 
     # ---- which texels are exact ----------------------------------------------------------------------------
 
@@ -573,7 +571,7 @@ class LightTransport:
 
     def _radiance(self, envmap):
         """List every texel's radiance, its largest channel, and solid angle; 0 where no light comes from."""
-        omega = np.repeat(latlong.solid_angles(self.grid.height, self.grid.width), self.grid.width)
+        omega = np.repeat(latlong.solid_angles(*self.grid.shape), self.grid.width)
         # A texel that no sample has met may matter as much as its row: rows are known from many samples.
         reached = np.repeat((self.influence > 0).any(axis=1), self.grid.width)
         return envmap.reshape(-1, 3).astype(np.float64).max(axis=1) * reached, omega * reached

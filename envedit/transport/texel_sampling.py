@@ -22,6 +22,7 @@ class Grid:
     """
 
     def __init__(self, height: int, width: int, to_world: np.ndarray, mass: np.ndarray):
+        self.shape = height, width
         self.height, self.width = height, width
         self.texels = height * width
         self.to_world = mi.Matrix3f(np.asarray(to_world, dtype=np.float32))

@@ -124,24 +124,19 @@ def record(scene: mi.Scene, grid: Grid, pixels: np.ndarray, spp: int, bounces: i
     A contribution that is not finite (a BSDF that overflows) would make its pixel non-finite under any map:
     it is left out and counted.
     """
-    rows = []
-    columns = []
-    weights = []
+    parts = [(np.zeros(0, np.uint32), np.zeros(0, np.uint32), np.zeros((0, 3), np.float32))]
     lost = 0
     for _, pixel, texel, value in contributions(scene, grid, pixels, spp, bounces, seed):
         dr.eval(pixel, texel, value)  # once: each read-back below would trace the rays again
         finite = dr.all(dr.isfinite(value))
         lost += int(dr.count(~finite)[0])
         keep = dr.compress(finite & (dr.max(dr.abs(value)) > 0))
-        if len(keep) == 0:
-            continue
-        rows.append(dr.gather(mi.UInt32, pixel, keep).numpy())
-        columns.append(dr.gather(mi.UInt32, texel, keep).numpy())
-        weights.append(np.stack([dr.gather(mi.Float, value[c], keep).numpy() for c in range(3)], axis=1))
-    if not rows:
-        return Recorded(np.zeros(0, np.uint32), np.zeros(0, np.uint32), np.zeros((0, 3), np.float32), lost)
-    merged = merge(np.concatenate(rows), np.concatenate(columns), np.concatenate(weights), grid.texels)
-    return Recorded(*merged, lost)
+        if len(keep):
+            weights = np.stack([dr.gather(mi.Float, value[c], keep).numpy() for c in range(3)], axis=1)
+            row, column = (dr.gather(mi.UInt32, index, keep).numpy() for index in (pixel, texel))
+            parts.append((row, column, weights))
+    entries = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return Recorded(*merge(*entries, grid.texels), lost)
 
 
 def record_all(

@@ -33,7 +33,7 @@ def brightest(envmap):
 def test_a_sun_of_one_texel_keeps_its_flux_and_goes_where_it_is_rotated(at, angles, rng):
     envmap = sunny(rng, at)
     matrix = Orientation(*angles).matrix
-    rotated = oriented.rotate(envmap, matrix)
+    rotated = oriented.oriented(envmap, Orientation(*angles))
     sky = flux(np.where(envmap > 1, 0.3, envmap))
     assert rotated.min() >= 0
     np.testing.assert_allclose(flux(rotated) - sky, flux(envmap) - sky, rtol=2e-3)

@@ -245,8 +245,9 @@ class Lights:
         if aureole is None:
             return mi.Color3f(1)
         index = dr.opaque(mi.UInt32, i)
-        centre = rotate(_row(mi.Vector3f, turn, index), dr.gather(mi.Vector3f, self._centre, index))
-        factor = _exp(_row(mi.Color3f, log_flux, index))
+        turned_by = dr.gather(mi.Vector3f, turn.array, index)
+        centre = rotate(turned_by, dr.gather(mi.Vector3f, self._centre, index))
+        factor = _exp(dr.gather(mi.Color3f, log_flux.array, index))
         return 1 + aureole.at(d, centre, factor)
 
 
@@ -338,11 +339,6 @@ def _strongest(glows, fluxes):
     """Return which light is the strongest of those that have a glow; None where none has one."""
     strength = [0.0 if glow is None else f @ LUMINANCE for glow, f in zip(glows, fluxes, strict=True)]
     return int(np.argmax(strength)) if strength and max(strength) > 0 else None
-
-
-def _row(kind, values, i):
-    """Return row ``i`` of a tensor (n, 3)."""
-    return kind(*(dr.gather(mi.Float, values.array, i * 3 + k) for k in range(3)))
 
 
 def _exp(x):

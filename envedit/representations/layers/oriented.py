@@ -29,12 +29,19 @@ BAND_TEXELS = 1 << 20
 def oriented(image: np.ndarray, orientation: Orientation, lights: list[Light] | None = None) -> np.ndarray:
     """Rotate a map (H, W, 3) float32; columns that are only turned move as of :func:`.latlong.rotate`.
 
-    ``lights`` are those of the map; None: they are looked for. With [] all is sampled as sky is, quickly, and
-    a sun keeps its flux to 4 %.
+    Otherwise the sky is resampled once, and ``lights`` keep their flux, which is radiance times
+    :func:`.latlong.lookup_solid_angles`. They are those of the map; None: they are looked for. With [] all is
+    sampled as sky is, quickly, and a sun keeps its flux to 4 %.
     """
     if orientation.level:
         return latlong.rotate(image, orientation.turn)
-    return rotate(image, orientation.matrix, lights)
+    if lights is None:
+        lights = file_lights.lights_of(image)
+    matrix, rows = orientation.matrix, (0, len(image))
+    result = resampled(file_lights.without(image, lights), matrix, rows, rows, SKY_SAMPLES)
+    for light in lights:
+        add_rotated(result, light, matrix)
+    return result
 
 
 def oriented_share(share: np.ndarray, orientation: Orientation) -> np.ndarray:
@@ -44,22 +51,6 @@ def oriented_share(share: np.ndarray, orientation: Orientation) -> np.ndarray:
     rotated = oriented(np.repeat(share[..., None], 3, axis=2), orientation, [])[..., 0]
     rotated[rotated > 1 - ROUNDING] = 1
     return rotated
-
-
-def rotate(radiance: np.ndarray, matrix: np.ndarray, lights: list[Light] | None = None) -> np.ndarray:
-    """Rotate a map (H, W, 3) float32 on the sphere by a matrix (3, 3); its ``lights`` keep their flux.
-
-    The sky is resampled once. Flux is radiance times :func:`.latlong.lookup_solid_angles`.
-    """
-    shape = radiance.shape[:2]
-    if lights is None:
-        lights = file_lights.lights_of(radiance)
-    result = resampled(
-        file_lights.without(radiance, lights), matrix, (0, shape[0]), (0, shape[0]), SKY_SAMPLES
-    )
-    for light in lights:
-        add_rotated(result, light, matrix)
-    return result
 
 
 def add_rotated(envmap: np.ndarray, light: Light, matrix: np.ndarray, flux: np.ndarray | None = None) -> None:

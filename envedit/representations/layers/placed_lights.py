@@ -7,7 +7,7 @@ Lights of the map move as :mod:`.layers` moves them, with their glow. A light th
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -50,8 +50,7 @@ class PlacedLights:
 
     def __init__(self, envmap: np.ndarray, horizon: str = "auto"):
         self.envmap = envmap
-        kind: Any = below_horizon.kind_of(envmap) if horizon == "auto" else horizon
-        self.layers = Layers.of(envmap, horizon=kind)
+        self.layers = Layers.of(envmap, horizon=below_horizon.treatment(horizon, "all", envmap))
         self._still = self.layers.start()
         self.lights = self.layers.separation.lights
 

@@ -112,9 +112,25 @@ class Survey:
 def survey_of(
     image: np.ndarray, rows: tuple[int, int] | None = None, most: int = MOST_LIGHTS
 ) -> Survey | None:
-    """Find the lights of a map on its small copy; None without lights. Parameters as of :func:`separate`."""
-    first, total = rows or (0, image.shape[0])
-    return _survey(_reduced(image, first, total), most)
+    """Find lights, the background under them and the glow of each on the small copy of a map.
+
+    Parameters are as of :func:`separate`; None without lights.
+    """
+    small = _reduced(image, *(rows or (0, len(image))))
+    label, count = _find(small, most)
+    if not count:
+        return None
+    cores = label >= 0
+    free = filled(small.image, cores)
+    glows, centres = [], []
+    for i in range(count):
+        centre = small.centre(label == i)
+        table = _glow(free, small, cores, centre)
+        if table is not None:
+            free = free / (1 + glow_at(table, small.directions @ centre))
+        glows.append(table)
+        centres.append(centre)
+    return Survey(label, filled(free, cores), small.rows, centres, glows)
 
 
 def separate(
@@ -170,24 +186,6 @@ def glow_of(survey: Survey, directions: np.ndarray) -> np.ndarray:
         if table is not None:
             glow *= 1 + glow_at(table, directions @ centre)
     return glow
-
-
-def _survey(small: _Small, most: int) -> Survey | None:
-    """Find lights, the background under them and the glow of each on the small copy; None without lights."""
-    label, count = _find(small, most)
-    if not count:
-        return None
-    cores = label >= 0
-    free = filled(small.image, cores)
-    glows, centres = [], []
-    for i in range(count):
-        centre = small.centre(label == i)
-        table = _glow(free, small, cores, centre)
-        if table is not None:
-            free = free / (1 + glow_at(table, small.directions @ centre))
-        glows.append(table)
-        centres.append(centre)
-    return Survey(label, filled(free, cores), small.rows, centres, glows)
 
 
 # ---- Finding -----------------------------------------------------------------------------------------------

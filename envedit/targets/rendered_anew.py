@@ -85,10 +85,12 @@ def high_pass(picture: np.ndarray, views: Views = (slice(None),)) -> np.ndarray:
     return np.concatenate(parts)
 
 
-def _block_means(values, size=8):
-    """Return the means of blocks of pixels, whose errors are independent: (blocks,)."""
-    rows = np.arange(0, values.shape[0], size)
-    columns = np.arange(0, values.shape[1], size)
-    sums = np.add.reduceat(np.add.reduceat(values, rows, axis=0), columns, axis=1)
-    counts = np.add.reduceat(np.add.reduceat(np.ones_like(values), rows, axis=0), columns, axis=1)
-    return (sums / counts).ravel()
+def _block_means(values):
+    """Return the means of blocks of 8 x 8 pixels, whose errors are independent: (blocks,)."""
+
+    def sums(image):
+        for axis in (0, 1):
+            image = np.add.reduceat(image, np.arange(0, image.shape[axis], 8), axis=axis)
+        return image
+
+    return (sums(values) / sums(np.ones_like(values))).ravel()

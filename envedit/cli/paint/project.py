@@ -234,11 +234,10 @@ def recent() -> list[dict]:
         listed = json.loads(_recent_file().read_text(encoding="utf-8"))
         found = [{"path": str(one["path"]), "title": str(one["title"])} for one in listed]
         there = [one for one in found if Path(one["path"]).is_file()][:_RECENT]
-        pictures = [Path(one["path"]).with_name("render_edited.exr") for one in there]
-        return [
-            one | {"picture": str(picture) if picture.is_file() else ""}
-            for one, picture in zip(there, pictures, strict=True)
-        ]
+        for one in there:
+            picture = Path(one["path"]).with_name("render_edited.exr")
+            one["picture"] = str(picture) if picture.is_file() else ""
+        return there
     return []
 
 

@@ -132,11 +132,11 @@ def record(scene: mi.Scene, grid: Grid, pixels: np.ndarray, spp: int, bounces: i
         lost += int(dr.count(~finite)[0])
         keep = dr.compress(finite & (dr.max(dr.abs(value)) > 0))
         if len(keep):
-            weights = np.stack([dr.gather(mi.Float, value[c], keep).numpy() for c in range(3)], axis=1)
+            colours = np.stack([dr.gather(mi.Float, value[c], keep).numpy() for c in range(3)], axis=1)
             row, column = (dr.gather(mi.UInt32, index, keep).numpy() for index in (pixel, texel))
-            parts.append((row, column, weights))
-    entries = (np.concatenate(part) for part in zip(*parts, strict=True))
-    return Recorded(*merge(*entries, grid.texels), lost)
+            parts.append((row, column, colours))
+    rows, columns, weights = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return Recorded(*merge(rows, columns, weights, grid.texels), lost)
 
 
 def record_all(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Protocol
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -15,6 +16,11 @@ if TYPE_CHECKING:
 
 EPSILON = 0.01
 """Added to radiance inside a logarithm (paper, below Eq. 3)."""
+
+
+def not_negative(radiance: mi.TensorXf) -> mi.TensorXf:
+    """Clip below at zero, but keep the slope: with the clip's, a black texel would stay black for good."""
+    return dr.replace_grad(dr.maximum(radiance, 0), radiance)
 
 
 class Representation(Protocol):

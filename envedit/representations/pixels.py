@@ -8,12 +8,7 @@ import numpy as np
 
 from envedit.core.arrays import tensor
 from envedit.core.radiance import BRIGHTEST, require_radiance
-from envedit.representations.base import EPSILON, Params
-
-
-def _not_negative(radiance):
-    """Clip below at zero, but keep the slope: with the clip's, a black texel would stay black for good."""
-    return dr.replace_grad(dr.maximum(radiance, 0), radiance)
+from envedit.representations.base import EPSILON, Params, not_negative
 
 
 class Pixels:
@@ -32,7 +27,7 @@ class Pixels:
 
     def decode(self, params: Params) -> mi.TensorXf:
         """Return the stored radiance, clipped below at zero."""
-        return _not_negative(params["radiance"])
+        return not_negative(params["radiance"])
 
 
 class LogPixels:
@@ -49,4 +44,4 @@ class LogPixels:
 
     def decode(self, params: Params) -> mi.TensorXf:
         """Return exp(x) - 0.01, not below zero; x is held under 80, as float32 would overflow in a sum."""
-        return _not_negative(dr.exp(dr.minimum(params["log_radiance"], 80)) - EPSILON)
+        return not_negative(dr.exp(dr.minimum(params["log_radiance"], 80)) - EPSILON)

@@ -25,7 +25,7 @@ from envedit.core.array_cache import DiskCache, cache_folder, holds
 from envedit.core.arrays import tensor
 from envedit.core.errors import InputError, NumericalError, place_of
 from envedit.losses import losses, metrics, optimizer, ssim
-from envedit.representations.base import EPSILON
+from envedit.representations.base import EPSILON, not_negative
 from envedit.representations.siren import network as siren
 from envedit.representations.siren import output_layer
 
@@ -65,9 +65,8 @@ class Normalisation:
 
     def decode(self, values: mi.TensorXf) -> mi.TensorXf:
         """Map network output in (0, 1) to finite radiance >= 0 (Eq. 2-3), on tensors and arrays."""
-        # dr.exp is infinite from 88.38 on. Below 0, where a flat or black map can lead, the slope is kept.
-        radiance = dr.exp(dr.minimum(values * self.span + self.low, 88)) - EPSILON
-        return dr.replace_grad(dr.maximum(radiance, 0), radiance)
+        # dr.exp is infinite from 88.38 on; a flat or black map can lead below 0.
+        return not_negative(dr.exp(dr.minimum(values * self.span + self.low, 88)) - EPSILON)
 
 
 @dataclass

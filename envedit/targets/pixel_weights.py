@@ -6,6 +6,7 @@ import numpy as np
 
 from envedit import config
 from envedit.core.errors import InputError
+from envedit.scene.scene import Scene
 
 FOLLOWING = 0.1
 """Weight, beside paint, of what was not painted and follows: its pattern, as its mean has a term of its own
@@ -21,6 +22,11 @@ def first_hold(settings: config.Config) -> float:
     if chosen.hold != "auto":
         return float(chosen.hold)
     return FOLLOWING if chosen.rest == "follow" and settings.newton else 1.0
+
+
+def hidden_pixels(scene: Scene) -> np.ndarray:
+    """Return the pixels, bool (h, w), that see no surface where emitters are hidden: they do not count."""
+    return np.zeros((scene.height, scene.width), bool) if scene.alpha is None else scene.alpha == 0
 
 
 def pixel_weight(coverage: np.ndarray, excluded: np.ndarray, paint: float, hold: float) -> np.ndarray:

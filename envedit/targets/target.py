@@ -26,7 +26,7 @@ from envedit.scene.renderings import rendered
 from envedit.scene.scene import Scene
 from envedit.targets import initial_rendering, painted_image, rendered_anew, strokes
 from envedit.targets import photo as photographs
-from envedit.targets.pixel_weights import first_hold, pixel_weight
+from envedit.targets.pixel_weights import first_hold, hidden_pixels, pixel_weight
 
 FOUND_ANEW = (
     " (its noise is not that of the initial rendering: it is solved as a rendering under other light; "
@@ -128,7 +128,7 @@ def make(
     :data:`.radiance.BRIGHTEST`; a picture that is so bright is cut there, with a warning. ConfigError if a
     view is not the scene's, or is given twice; as of :func:`.extensions.load`.
     """
-    hidden = None if scene.alpha is None else scene.alpha == 0
+    hidden = hidden_pixels(scene)
     made = _made(settings, scene, envmap, picture, mask, other, hidden)
     return _seen(made, hidden, settings.output.tonemap)
 
@@ -186,14 +186,14 @@ def _made(settings, scene, envmap, picture, mask, other, hidden):
         warnings += (f"target: {over} pixels are brighter than {BRIGHTEST:.3g}: they count as that bright",)
 
     # ---- How much each pixel counts
-    coverage = painted.coverage if hidden is None else np.where(hidden[..., None], 0, painted.coverage)
+    coverage = np.where(hidden[..., None], 0, painted.coverage)
     if painted.coverage.any() and not coverage.any():
         raise InputError(
             "target: all paint lies where no surface is seen (hide_emitters): paint on a surface"
         )
     uncounted = painted.excluded & (coverage[..., 0] > 0)  # what was not painted has the initial value
     hold = first_hold(settings)
-    weight = pixel_weight(coverage, uncounted if hidden is None else uncounted | hidden, chosen.paint, hold)
+    weight = pixel_weight(coverage, uncounted | hidden, chosen.paint, hold)
     share = 100 * float((coverage > 0).mean())
     source += f", {share:.3g} % of the pixels; weights {chosen.paint:g} (paint) and {hold:g} (the rest)"
     return Target(picture, weight, None, source, warnings, initial, coverage, asked)
@@ -349,13 +349,12 @@ def _seen(target, hidden, curve):
     And warn of a target that is largely white on a display.
     """
     white = (apply_tonemap(target.picture, curve) >= 1).all(axis=2)
-    counted = white if hidden is None else white & ~hidden
-    share = counted.sum() / (white.size if hidden is None else max((~hidden).sum(), 1))
+    share = (white & ~hidden).sum() / max((~hidden).sum(), 1)
     if share > MOST_WHITE and target.photo is None:
         line = f"target: {100 * share:.3g} % of its pixels are white under the tonemap '{curve}', where "
         line += "measures and pictures show no difference: lower scene.scale, or set another output.tonemap"
         target = replace(target, warnings=(*target.warnings, line))
-    if hidden is None or not hidden.any():
+    if not hidden.any():
         return target
     weight = np.ones((*hidden.shape, 1), np.float32) if target.weight is None else target.weight
     weight = np.where(hidden[..., None], 0, weight).astype(np.float32)

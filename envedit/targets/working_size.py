@@ -17,7 +17,7 @@ from envedit.core.resampling import fit
 from envedit.representations.layers.gain import CYCLES
 from envedit.scene.scene import Scene
 from envedit.targets import initial_rendering, rendered_anew
-from envedit.targets.pixel_weights import first_hold, pixel_weight
+from envedit.targets.pixel_weights import first_hold, hidden_pixels, pixel_weight
 from envedit.targets.target import Target, with_noise
 
 PIXELS = 128 * 128
@@ -69,7 +69,7 @@ def worked_on(
     under ``envmap`` (H, W, 3), the map that is edited.
     """
     chosen = settings.target
-    hidden = np.zeros((small.height, small.width), bool) if small.alpha is None else small.alpha == 0
+    hidden = hidden_pixels(small)
     if target.coverage is None or target.initial is None or target.weight is None:
         weight = None
         if target.photo is not None:

@@ -27,7 +27,7 @@ from envedit.scene.scene import Scene
 from envedit.solve import gauss_newton, hold, map_problem, prior, search
 from envedit.solve.likelihood import SIGMA, Likelihood
 from envedit.targets import strokes
-from envedit.targets.pixel_weights import first_hold, pixel_weight
+from envedit.targets.pixel_weights import first_hold, hidden_pixels, pixel_weight
 from envedit.transport.light_transport import LightTransport
 
 COLUMNS = 32
@@ -83,9 +83,7 @@ class Solution:
         self.transport, self.rows = transport, rows
         self.document = Document()
         self.explanations: list[search.Explanation] = []
-        # Pixels that see no surface, where the scene hides what lights it: they do not count.
-        shape = scene.height, scene.width
-        self._hidden = np.zeros(shape, bool) if scene.alpha is None else scene.alpha == 0
+        self._hidden = hidden_pixels(scene)
 
     # ---- what is painted on --------------------------------------------------------------------------------
 

@@ -87,11 +87,12 @@ class ExactColumns:
         keep: np.ndarray | None = None,
         blocks: int | None = None,
     ) -> None:
-        """Trace columns of distinct texels with so many camera paths a pixel; those that were are replaced.
+        """Trace columns of distinct texels with so many camera paths a pixel, in place of older ones.
 
-        No more of them are new than there is :attr:`room` and columns to give up. Texels in ``keep`` give
-        their columns up last, the first of them last of all. Only so many ``blocks`` of pixels are traced, if
-        given: enough to have all kernels, but no column to be used.
+        ``seed`` is that of every random choice. No more of the texels are new than there is :attr:`room` and
+        columns to give up. Texels in ``keep`` give their columns up last, the first of them last of all. Only
+        so many ``blocks`` of pixels are traced, if given: enough to have all kernels, but no column to be
+        used.
         """
         self._take_slots(texels[self.slot_of[texels] < 0], texels, keep)
         self.paths_of[texels] = count

@@ -29,8 +29,8 @@ def determined(influence: np.ndarray, samples: np.ndarray, rows: slice, threshol
     """Say which texels a view determines: bool (H, W).
 
     A texel is determined if it or a neighbour has more than ``threshold`` of the mean influence (H, W), T' 1,
-    per solid angle of the active ``rows``; with 0 all are. The neighbourhood is so wide that of the
-    ``samples`` (H,) that a texel of each row has received :data:`WANTED_SAMPLES` would have found of it:
+    per solid angle of the active ``rows``; with 0 all are. The neighbourhood is so wide that, by the
+    ``samples`` (H,) that a texel of each row has received, :data:`WANTED_SAMPLES` of them would have met it:
     noise may keep a texel that hardly matters, but does not take one that does.
     """
     height, width = influence.shape

@@ -39,14 +39,9 @@ _ABANDONED = 3600.0  # seconds after which a temporary file belongs to no writer
 
 
 class DiskCache:
-    """Dicts of arrays by key.
+    """Dicts of arrays by key, in files of at most ``most_bytes`` in all.
 
-    Parameters
-    ----------
-    folder : Path or None
-        Where the files lie; made when first needed. None: nothing is kept.
-    most_bytes : int
-        Bound on the size of the files in it.
+    ``folder`` is made when first needed; None: nothing is kept.
     """
 
     def __init__(self, folder: Path | None, most_bytes: int = MOST_BYTES):
@@ -188,12 +183,7 @@ def _read(path, text):
 def holds(arrays: dict[str, np.ndarray], expected: dict[str, tuple]) -> bool:
     """Return whether arrays have these names, types and shapes, and hold finite numbers.
 
-    Parameters
-    ----------
-    arrays : dict of str to ndarray
-        As of :meth:`DiskCache.load`.
-    expected : dict of str to (dtype, shape)
-        A length of None in a shape is any.
+    ``expected`` has type and shape by name; a length of None in a shape is any.
     """
     return arrays.keys() == expected.keys() and all(
         array.dtype == np.dtype(dtype)

@@ -24,12 +24,7 @@ def tensor(values: ArrayLike) -> mi.TensorXf:
 def flat(kind: type[DrArray], values: ArrayLike) -> DrArray:
     """Copy numbers to an array of a Dr.Jit type; done when this returns, so that ``values`` may change.
 
-    Parameters
-    ----------
-    kind : type
-        ``mi.Float``, ``mi.Bool``, ``mi.Int32`` ...
-    values : ndarray
-        Of the dtype that ``kind`` has; raveled.
+    ``values`` have the dtype of ``kind``, such as ``mi.Float``, and any shape.
     """
     array = dr.opaque(kind(np.ascontiguousarray(values).ravel()))
     dr.eval(array)

@@ -25,16 +25,14 @@ from envedit.core.types import ArrayLike
 
 MIN_HEIGHT, MIN_WIDTH = 3, 2
 """Mitsuba silently resamples anything smaller than this, so that ``envmap.data`` no longer is the image."""
+_HALO = ((0, 0), (1, 1), (0, 0))  # columns that ``envmap.data`` repeats on either side
 
 
 # ---- Directions and positions ------------------------------------------------------------------------------
 
 
 def directions(height: int, width: int, rows: slice = slice(None)) -> np.ndarray:  # noqa: B008
-    """Return the unit vectors ``(H, W, 3)`` float64 through the texel centres, in the emitter's frame.
-
-    Of some ``rows`` only, if fewer are needed.
-    """
+    """Return unit vectors (H, W, 3) float64 through the texel centres of ``rows``, in the emitter's frame."""
     _check_size(height, width)
     theta = np.array([math.pi / 2]) if height == 1 else np.pi * np.arange(height) / (height - 1)
     phi = 2 * np.pi * (np.arange(width) + 0.5) / width
@@ -65,8 +63,7 @@ def texel_position(d: ArrayLike, height: int, width: int) -> tuple[np.ndarray, n
     _check_size(height, width)
     d = np.asarray(d, np.float64)
     x, y, z = d[..., 0], d[..., 1], d[..., 2]
-    u = np.arctan2(x, -z) / (2 * np.pi)
-    u = u - np.floor(u)
+    u = np.arctan2(x, -z) / (2 * np.pi) % 1.0
     u = np.where(u >= 1.0, 0.0, u)  # a tiny negative angle rounds up to exactly one turn
     v = np.arctan2(np.hypot(x, z), y) / np.pi  # acos(y), without its loss of digits near the poles
     return v * (height - 1), u * width - 0.5
@@ -131,17 +128,9 @@ def resize(image: ArrayLike, height: int, width: int) -> np.ndarray:
     (:func:`lookup_solid_angles`) a constant is exact; a single lit texel of a 256-wide map, doubled or
     quadrupled, gains 0.7 % at a pole, under 0.2 % elsewhere.
 
-    Parameters
-    ----------
-    image : array (H, W, C)
-        Linear radiance. A non-finite texel spreads to every new texel that covers it: repair first.
-    height, width : int
-        New size, each at least 1.
-
-    Returns
-    -------
-    array (height, width, C) float32
-        Sums are accumulated in float64; memory beyond the result is one (height, W, C) float64 array.
+    ``image`` (H, W, C) is linear radiance, returned as (height, width, C) float32. A non-finite texel spreads
+    to every new texel that covers it: repair first. Sums are accumulated in float64; memory beyond the result
+    is one (height, W, C) float64 array.
     """
     image = np.asarray(image)
     if image.ndim != 3:
@@ -163,11 +152,8 @@ def resize(image: ArrayLike, height: int, width: int) -> np.ndarray:
 
 def _row_weights(old: int, new: int) -> Iterator[tuple[slice | list[int], np.ndarray]]:
     """Yield (source rows, weights) for each new row."""
-    if new == old:
-        yield from (([i], np.ones(1)) for i in range(new))
-    elif new < old:
-        source, target = row_edges(old), row_edges(new)
-        yield from _overlaps(source, target, _caps)
+    if new <= old:
+        yield from _overlaps(row_edges(old), row_edges(new), _caps)
     else:
         position = np.zeros(new) if old == 1 else np.arange(new) * ((old - 1) / (new - 1))
         for p in position:
@@ -177,9 +163,7 @@ def _row_weights(old: int, new: int) -> Iterator[tuple[slice | list[int], np.nda
 
 def _column_weights(old: int, new: int) -> Iterator[tuple[slice | list[int], np.ndarray]]:
     """Yield (source columns, weights) for each new column."""
-    if new == old:
-        yield from (([i], np.ones(1)) for i in range(new))
-    elif new < old:
+    if new <= old:
         yield from _overlaps(np.arange(old + 1) / old, np.arange(new + 1) / new, np.diff)
     else:
         for p in (np.arange(new) + 0.5) * (old / new) - 0.5:
@@ -228,9 +212,8 @@ def halo_index(height: int, width: int) -> np.ndarray:
     ``dr.gather(type(env.array), env.array, index)``.
     """
     check_envmap_size(height, width)
-    column = np.arange(-1, width + 1) % width
-    texel = np.arange(height)[:, None] * width + column
-    return (3 * texel[..., None] + np.arange(3)).astype(np.uint32).ravel()
+    index = np.arange(height * width * 3, dtype=np.uint32).reshape(height, width, 3)
+    return np.pad(index, _HALO, mode="wrap").ravel()
 
 
 def to_envmap_data(image: ArrayLike) -> np.ndarray:
@@ -244,7 +227,7 @@ def to_envmap_data(image: ArrayLike) -> np.ndarray:
     if image.ndim != 3 or image.shape[2] != 3:
         raise ValueError(f"to_envmap_data: a map is (H, W, 3), got shape {image.shape}")
     check_envmap_size(*image.shape[:2])
-    return np.concatenate([image[:, -1:], image, image[:, :1]], axis=1)
+    return np.pad(image, _HALO, mode="wrap")
 
 
 def from_envmap_data(data: ArrayLike) -> np.ndarray:

@@ -83,3 +83,12 @@ class Orientation(NamedTuple):
 def rotation_matrix(turn: np.ndarray) -> np.ndarray:
     """Return the matrix (3, 3) of a rotation vector (3,)."""
     return np.stack([rotated(axis, turn) for axis in np.eye(3)], axis=1)
+
+
+def rotation_in(matrix: np.ndarray, rounding: float) -> np.ndarray | None:
+    """Return a matrix (3, 3) without its uniform scale; None unless that is a rotation, to ``rounding``."""
+    size = np.cbrt(np.linalg.det(matrix)) if np.isfinite(matrix).all() else 0.0
+    if not size > 0:
+        return None
+    rotation = matrix / size
+    return rotation if np.abs(rotation @ rotation.T - np.eye(3)).max() <= rounding else None

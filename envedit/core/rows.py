@@ -9,10 +9,7 @@ from dataclasses import dataclass
 class Rows:
     """Rows ``first`` to ``last`` of a map of ``total``: ``envmap[rows.slice]`` has ``count``.
 
-    Raises
-    ------
-    ValueError
-        The map does not have them.
+    ValueError if the map does not have them.
     """
 
     first: int

@@ -55,12 +55,8 @@ def load(
 
     ``scene`` is a file, the name of a shipped scene, a dict as ``mi.load_dict`` takes it, a Scene, or a built
     ``mitsuba.Scene``, for which all but ``sensors`` and ``scale`` is fixed. Other parameters are those of
-    :func:`.scene.load`.
-
-    Raises
-    ------
-    ConfigError, InputError
-        As of :func:`.scene.load` and :func:`wrapped`, or if it is none of these.
+    :func:`.scene.load`. ConfigError and InputError are as of it and of :func:`wrapped`, also if it is none of
+    these.
     """
     if isinstance(scene, Scene):
         return scene
@@ -81,22 +77,11 @@ def wrapped(scene: Any, sensors: str | Sequence[int | str] = "all") -> Scene:
 
     The ``scale`` of its ``envmap`` becomes 1, as that of every :class:`.Scene`; the former one is in ``own``.
     Light transport and renderings of such a scene are not found on disk by another run: what it is
-    made of cannot be read from it.
+    made of cannot be read from it. ``sensors`` is "all", or [0] where the scene has one sensor.
 
-    Parameters
-    ----------
-    scene : mitsuba.Scene
-        Of the present variant.
-    sensors : "all" or sequence of int and str
-        "all", or [0] where the scene has one sensor.
-
-    Raises
-    ------
-    ConfigError
-        It is no scene of the present variant, or some of several sensors are asked for.
-    InputError
-        Its environment is no ``envmap``, or stands askew, a sensor is of a kind that makes no picture, or
-        there is a medium that its integrator would render.
+    ConfigError if it is no scene of the present variant, or some of several sensors are asked for. InputError
+    if its environment is no ``envmap``, or stands askew, a sensor is of a kind that makes no picture, or
+    there is a medium that its integrator would render.
     """
     # ---- Refuse what makes no picture of a map
     if not is_built(scene):
@@ -133,13 +118,11 @@ def wrapped(scene: Any, sensors: str | Sequence[int | str] = "all") -> Scene:
 
     # ---- Sensors and integrator
     width, views = scenes.views_of(scene, [c.id() or f"sensor {k}" for k, c in enumerate(cameras)])
-    max_depth, rr_depth, hide, notes = _integrator(scene)
     unique = UNKNOWN + uuid.uuid4().hex
     own = OwnMap(None, scale)
     rows = views[-1].rows.stop
-    return Scene(
-        scene, None, width, rows, key, to_world, unique, params, views, own, max_depth, rr_depth, hide, notes
-    )
+    paths = _integrator(scene)  # max_depth, rr_depth, hide_emitters and notes
+    return Scene(scene, None, width, rows, key, to_world, unique, params, views, own, *paths)
 
 
 def own_map(scene: Any) -> np.ndarray:

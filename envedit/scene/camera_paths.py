@@ -78,6 +78,10 @@ def trace(
 ) -> Iterator[Vertex | Escape]:
     """Trace camera paths and yield, bounce by bounce, where they leave the scene and where they hit it.
 
+    That is the escape of bounce 0, the vertex of bounce 1, the escape of bounce 1, ... the escape of bounce
+    ``bounces``; then, with ``beyond``, one escape of all further bounces. Where the scene's integrator hides
+    emitters, camera rays pass shapes that are lamps, and those that leave the scene are not active.
+
     Parameters
     ----------
     scene : mi.Scene
@@ -92,15 +96,6 @@ def trace(
         Seed of every random choice.
     beyond : bool
         Follow paths that have not left the scene by then to their end, by Russian roulette.
-
-    Where the scene's integrator hides emitters, camera rays pass shapes that are lamps, and those that leave
-    the scene are not active.
-
-    Yields
-    ------
-    Escape, Vertex
-        Escape of bounce 0, vertex of bounce 1, escape of bounce 1, ... escape of bounce ``bounces``; then,
-        with ``beyond``, one escape of all further bounces.
     """
     # ---- One lane for each path, with its own samples
     n = len(pixels) * paths

@@ -2,13 +2,14 @@
 
 Mitsuba's film adds samples with atomics: where a pixel's samples lie with two threads, and wherever a filter
 is wider than a pixel, in the order in which the threads come to them; a NaN is dropped silently. Here the
-samples of a pixel are one block, summed by one thread in double precision. Rays and samples are those of
-Mitsuba's own loop.
+samples of a pixel are one block, summed by one thread in double precision, and blocks of neighbouring pixels
+are added in turn. Rays and samples are those of Mitsuba's own loop.
 """
 
 from __future__ import annotations
 
 import contextlib
+import itertools
 from collections.abc import Iterator
 
 import drjit as dr
@@ -21,19 +22,14 @@ def render(scene: mi.Scene, integrator: mi.Integrator, spp: int, seed: int, view
 
     ``view`` is the sensor's index; its film gives size, crop and filter. ``integrator`` is a sampling one,
     such as ``path``. There are ``spp`` samples a pixel, or as many more as the sampler needs to fill its
-    grid.
-
-    Returns
-    -------
-    array (height, width, 4) float64
-        sum f(p - s) L(s) / sum f(p - s), over the samples s near a pixel p, f the film's filter; and alpha,
-        the same of samples whose path hits something that is not hidden.
+    grid. Returned, as (height, width, 4) float64, are sum f(p - s) L(s) / sum f(p - s), over the samples s
+    near a pixel p, f the film's filter; and alpha, the same of samples whose path hits something that is not
+    hidden.
     """
     # ---- Sampler and size, with the border that the filter reaches into
     sensor = scene.sensors()[view]
     film = sensor.film()
     rfilter = film.rfilter()
-    box = rfilter.is_box_filter()
     border = rfilter.border_size() if film.sample_border() else 0
     width, height = (int(n) for n in film.crop_size())
     across, down = width + 2 * border, height + 2 * border
@@ -51,53 +47,20 @@ def render(scene: mi.Scene, integrator: mi.Integrator, spp: int, seed: int, view
     channels = _radiance(scene, sensor, integrator, sampler, corner + inside, spp)
     dr.eval(channels, inside)  # the sums below must not trace again
 
-    # ---- Sums over the samples of each pixel, in a fixed order
-    if box:
-        sums = [
-            dr.block_sum(mi.Float64(channel), spp) for channel in (*channels, dr.full(mi.Float, 1, count))
-        ]
-        total = np.stack([plane.numpy() for plane in sums], axis=-1).reshape(down, across, 5)
-        total = total[border : border + height, border : border + width]
-    else:
-        reach = int(np.ceil(rfilter.radius() - 0.5))
-        places = [dr.opaque(mi.Int32, n) for n in (width, across, down, border, reach, spp)]
-        pixels = dr.arange(mi.Int32, width * height)
-        sums = _filtered(pixels, rfilter, channels, inside.x - 0.5, inside.y - 0.5, *places)
-        total = np.stack([plane.numpy() for plane in sums], axis=-1).reshape(height, width, 5)
+    # ---- Sums over the samples of each pixel, for every neighbour that they count for
+    reach = int(np.ceil(rfilter.radius() - 0.5))
+    total = np.zeros((down + 2 * reach, across + 2 * reach, 5))
+    for row, column in itertools.product(range(2 * reach + 1), repeat=2):
+        dx, dy = dr.opaque(mi.Float, reach - column), dr.opaque(mi.Float, reach - row)
+        weight = rfilter.eval(inside.x - 0.5 + dx) * rfilter.eval(inside.y - 0.5 + dy)
+        planes = []
+        for channel in (*channels, mi.Float(1)):
+            weighted = dr.select(weight == 0, 0, weight * channel)  # 0 also of an infinite channel
+            planes.append(dr.block_sum(mi.Float64(weighted), spp).numpy().reshape(down, across))
+        total[row : row + down, column : column + across] += np.stack(planes, axis=-1)
+    first = reach + border
+    total = total[first : first + height, first : first + width]
     return total[..., :4] / np.where(total[..., 4:] == 0, 1, total[..., 4:])
-
-
-@dr.syntax
-def _filtered(pixel, rfilter, channels, x, y, width, across, down, border, reach, spp):
-    """Sum the samples around each pixel by the filter: red, green, blue, alpha and weight, Float64.
-
-    ``x`` and ``y`` are the samples' places from the middle of their own pixel.
-    """
-    row, column = pixel // width + border, pixel % width + border
-    red, green, blue, alpha, total = (mi.Float64(0) for _ in range(5))
-    dy = mi.Int32(-reach)
-    while dy <= reach:
-        dx = mi.Int32(-reach)
-        while dx <= reach:
-            r, c = row + dy, column + dx
-            first = (r * across + c) * spp
-            k = mi.Int32(0)
-            stop = dr.select((r >= 0) & (r < down) & (c >= 0) & (c < across), spp, 0)
-            while k < stop:
-                i = mi.UInt32(first + k)
-                weight = rfilter.eval(dx + dr.gather(mi.Float, x, i)) * rfilter.eval(
-                    dy + dr.gather(mi.Float, y, i)
-                )
-                if weight != 0:
-                    red += mi.Float64(weight * dr.gather(mi.Float, channels[0], i))
-                    green += mi.Float64(weight * dr.gather(mi.Float, channels[1], i))
-                    blue += mi.Float64(weight * dr.gather(mi.Float, channels[2], i))
-                    alpha += mi.Float64(weight * dr.gather(mi.Float, channels[3], i))
-                    total += mi.Float64(weight)
-                k += 1
-            dx += 1
-        dy += 1
-    return red, green, blue, alpha, total
 
 
 def _radiance(scene, sensor, integrator, sampler, position, spp):

@@ -36,12 +36,8 @@ def direction(scene: Scene, view: int, x: float, y: float) -> np.ndarray:
     Returns
     -------
     ndarray (3,) float64
-        Unit vector in the frame of the map.
-
-    Raises
-    ------
-    NoPlaceError
-        What is seen there is not glossy, or reflects mostly another object.
+        Unit vector in the frame of the map. NoPlaceError if what is seen there is not glossy, or reflects
+        mostly another object.
     """
     value, specular, bounces, leaves, toward = _followed(scene, view, x, y)
     reflected = bounces > 0
@@ -59,20 +55,11 @@ def direction(scene: Scene, view: int, x: float, y: float) -> np.ndarray:
 
 
 def _followed(scene, view, x, y):
-    """Follow paths by glossy and specular reflection, an entry a path.
+    """Follow paths by glossy and specular reflection, and return arrays with an entry a path.
 
-    Returns
-    -------
-    value : ndarray (paths,) float64
-        prod(f_i), of specular surfaces their reflectance.
-    specular : ndarray of bool (paths,)
-        Whether all surfaces are.
-    bounces : ndarray of int (paths,)
-        Surfaces that reflect.
-    leaves : ndarray of bool (paths,)
-        Whether the path leaves the scene, and does not end at a surface that is not glossy.
-    toward : ndarray (paths, 3) float64
-        Its last direction in the world.
+    They are prod(f_i), with the reflectance of specular surfaces; whether all surfaces are specular; how many
+    reflect; whether the path leaves the scene, and does not end at a surface that is not glossy; and its last
+    direction in the world, (paths, 3).
     """
     path = dr.arange(mi.UInt32, PATHS)
     context = mi.BSDFContext()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 
@@ -43,20 +44,15 @@ class OwnLight:
         """Return the texels that the emitter was given, or average its radiance over those of a map.
 
         A map that is made is ``width`` texels wide and half as high; ``to_world`` (3, 3) is the rotation from
-        its frame to the scene's. Returned is linear radiance (H, W, 3) float32.
-
-        Raises
-        ------
-        InputError
-            Mitsuba cannot evaluate the emitter.
+        its frame to the scene's. Returned is linear radiance (H, W, 3) float32. InputError if Mitsuba cannot
+        evaluate the emitter.
         """
         if self.texels is not None:
             return self.texels
         # ---- The emitter, in a scene that it needs to know its bounds
         installed_plugins.come_first()
         config = mi.parser.ParserConfig(mi.variant())
-        built = parser.called(self.where, mi.parser.instantiate, config, self.state)
-        emitter = (built[0] if isinstance(built, list | tuple) else built).environment()
+        emitter = parser.instantiated(config, self.state, self.where).environment()
 
         def radiance(y, azimuth):
             """Return radiance (..., 3) at heights of unit vectors and azimuths of the map, of one shape."""
@@ -98,40 +94,26 @@ class OwnLight:
 
 def _edges(values):
     """Mark samples (h, w), periodic in w, whose neighbourhood of 3x3 differs by :data:`CONTRAST`."""
-    low, high = values, values
-    for axis in (0, 1):
-        low = _of_three(np.minimum, low, axis)
-        high = _of_three(np.maximum, high, axis)
-    return high > CONTRAST * np.maximum(low, 0)
-
-
-def _of_three(of, values, axis):
-    """Return the minimum or maximum of each value and its two neighbours along an axis."""
-    if axis == 1:
-        return of(of(values, np.roll(values, 1, axis=1)), np.roll(values, -1, axis=1))
-    padded = np.pad(values, ((1, 1), (0, 0)), mode="edge")
-    return of(of(padded[:-2], padded[1:-1]), padded[2:])
+    padded = np.pad(np.pad(values, ((0, 0), (1, 1)), mode="wrap"), ((1, 1), (0, 0)), mode="edge")
+    height, width = values.shape
+    around = [padded[i : i + height, j : j + width] for i in range(3) for j in range(3)]
+    low = functools.reduce(np.minimum, around)
+    return functools.reduce(np.maximum, around) > CONTRAST * np.maximum(low, 0)
 
 
 def _alone(state, index):
     """Return a parsed scene of one node and those that it refers to."""
-    scene = mi.parser.ParserState()
+    taken = [index]
+    for i in taken:
+        taken += [inner for inner in parser.references(state.nodes[i]).values() if inner not in taken]
     root = mi.parser.SceneNode()
     root.type, root.props = mi.ObjectType.Scene, mi.Properties("scene")
+    root.props["light"] = mi.Properties.ResolvedReference(1)
+    scene = mi.parser.ParserState()
     scene.nodes.append(root)
-
-    def taken(i):
-        node = mi.parser.SceneNode()
-        place = len(scene.nodes)
-        node.type, node.props = state.nodes[i].type, mi.Properties(state.nodes[i].props)
+    for i in taken:
+        node = mi.parser.SceneNode(state.nodes[i])
+        for name, inner in parser.references(node).items():
+            node.props[name] = mi.Properties.ResolvedReference(1 + taken.index(inner))
         scene.nodes.append(node)
-        for name, value in list(state.nodes[i].props.items()):
-            if isinstance(value, mi.Properties.ResolvedReference):
-                # The append of the inner node moves this one in memory.
-                inner = mi.Properties.ResolvedReference(taken(value.index()))
-                scene.nodes[place].props[name] = inner
-        return place
-
-    light = mi.Properties.ResolvedReference(taken(index))
-    scene.nodes[0].props["light"] = light
     return scene

@@ -16,15 +16,17 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from envedit.core import atomic_files
+from envedit.core import atomic_files, installed_plugins, rotations
 from envedit.core.errors import ConfigError, InputError
 from envedit.scene.scene_files import SceneFile
+from envedit.scene.scene_text import DEEPEST
 
 # Emitters at infinity that shine from every direction, with the axis of their zenith. Mitsuba's sky models
 # stand upright on z; a constant light has no zenith.
 _ENVIRONMENTS = {"envmap": "y", "constant": None, "sky": "z", "sunsky": "z", "timed_sunsky": "z"}
 _SMOOTH = {"roughconductor": "conductor", "roughplastic": "plastic", "roughdielectric": "dielectric"}
 _SMALLEST_ALPHA = 1e-4  # Mitsuba's own clamp
+_ROUNDING = 1e-4  # of a rotation's columns
 _LEVEL = 1e-3  # of a sensor's right: how far from a level one it may be
 _AXES = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1)}
 _REQUIRED = {"bitmap": ("filename", "bitmap", "data"), "blendbsdf": ("weight",), "normalmap": ("normalmap",)}
@@ -44,10 +46,9 @@ def called(where: str, call: Callable, /, *arguments: Any, **filled: Any) -> Any
         text = re.sub(r"\[[A-Za-z][\w.]*(:\d+)?\] ", "", str(error))
         text = "".join(c if c.isprintable() else " " for c in text)
         text = " ".join(text.split())
-        for prefix in (f"At {where} ", f"Error while loading {where} ", f"While loading {where} ",
-                       f"Parsing of XML file {where} failed: ", f'Parsing of XML file "{where}" failed: ',
-                       'At dictionary node "root": '):  # fmt: skip
-            text = text.replace(prefix, "")
+        file = re.escape(where)
+        text = re.sub(f'At {file} |(Error w|W)hile loading {file} |At dictionary node "root": ', "", text)
+        text = re.sub(f'Parsing of XML file "?{file}"? failed: ', "", text)
         hint = r"\g<0>; give it: --set scene.parameters.\1=VALUE"
         text = re.sub(r"undefined parameter: \$(\w+)", hint, text)
         raise InputError(f"{where}: {text if len(text) <= 300 else text[:297] + '...'}") from None
@@ -58,23 +59,59 @@ def place_of(state: mi.parser.ParserState, node: mi.parser.SceneNode, where: str
     return mi.parser.file_location(state, node) if state.files else f"{where}, {node.props.id()}"
 
 
+# ---- Nodes -------------------------------------------------------------------------------------------------
+
+
+def references(node: mi.parser.SceneNode) -> dict[str, int]:
+    """Return the indices of the nodes that a node refers to, by the names of its properties."""
+    kind = mi.Properties.ResolvedReference
+    return {name: value.index() for name, value in node.props.items() if isinstance(value, kind)}
+
+
+def inside(state: mi.parser.ParserState, node: mi.parser.SceneNode, kind: mi.ObjectType) -> list[int]:
+    """Return the indices of the nodes of a kind that a node refers to."""
+    return [i for i in references(node).values() if state.nodes[i].type == kind]
+
+
+def check_references(state: mi.parser.ParserState, where: str) -> None:
+    """Refuse a scene whose objects refer to one another too deeply for Mitsuba's recursion, with InputError.
+
+    That is in a chain longer than :data:`.scene_text.DEEPEST`, or in a circle.
+    """
+    by_name = dict(state.id_to_index)
+    below = []
+    for node in state.nodes:
+        named = [by_name[name] for _, name in node.props.references() if name in by_name]
+        below.append({*references(node).values(), *named})
+    ends = set(range(len(below)))  # of chains of one more reference in each round
+    for _ in range(DEEPEST):
+        ends = {child for node in ends for child in below[node]}
+    if ends:
+        raise InputError(f"{where}: objects refer to one another in a circle, or more than {DEEPEST} deep")
+
+
+def instantiated(config: mi.parser.ParserConfig, state: mi.parser.ParserState, where: str) -> mi.Scene:
+    """Build a parsed scene; InputError if Mitsuba cannot."""
+    built = called(where, mi.parser.instantiate, config, state)
+    return built[0] if isinstance(built, list | tuple) else built
+
+
 # ---- Changes -----------------------------------------------------------------------------------------------
 
 
-def lower_names(state: mi.parser.ParserState) -> None:
-    """Write the names of plugins as Mitsuba 3 has them: older ones took ``Rectangle`` too."""
-    for node in state.nodes:
-        name = node.props.plugin_name()
-        if name != name.lower():
-            node.props.set_plugin_name(name.lower())
+def check_plugin(state: mi.parser.ParserState, node: mi.parser.SceneNode, where: str) -> None:
+    """Refuse a plugin that is not installed, or lacks a property without which Mitsuba stops with a signal.
 
-
-def check_required(state: mi.parser.ParserState, node: mi.parser.SceneNode, where: str) -> None:
-    """Refuse a plugin that lacks a property without which Mitsuba stops with a signal."""
-    name = node.props.plugin_name()
+    Its name becomes that of Mitsuba 3: older ones took ``Rectangle`` too.
+    """
+    props = node.props
+    name = props.plugin_name().lower()
+    if name != props.plugin_name():
+        props.set_plugin_name(name)
+    place = place_of(state, node, where)
+    installed_plugins.check(name, place)
     needed = _REQUIRED.get(name, ())
-    if needed and not any(key in node.props for key in needed):
-        place = place_of(state, node, where)
+    if needed and not any(key in props for key in needed):
         raise InputError(f"{place}: {name} has no {' or '.join(needed)}; give it one")
 
 
@@ -95,20 +132,9 @@ def replace_environment(
 ) -> tuple[mi.Properties, np.ndarray, tuple[str, ...]]:
     """Put an ``envmap`` in place of the environment emitter, or add one; may move nodes, as :func:`append`.
 
-    Parameters
-    ----------
-    up : str
-        Axis of the map's zenith where the emitter has none: x, y, z, with or without a minus; "auto": that of
-        the first sensor (:func:`_sensor_up`).
-
-    Returns
-    -------
-    props : mitsuba.Properties
-        Of the ``envmap``.
-    to_world : ndarray (3, 3)
-        Its rotation.
-    notes : tuple of str
-        Where its zenith is, unless that is +y or the emitter's own.
+    ``up`` is the axis of the map's zenith where the emitter has none: x, y, z, with or without a minus;
+    "auto": that of the first sensor (:func:`_sensor_up`). Returns the properties of the ``envmap``; its
+    rotation (3, 3); and notes, where its zenith is unless that is +y or the emitter's own.
     """
     # ---- Where the map's zenith and its first azimuth are
     index = environment(state, where)
@@ -129,10 +155,8 @@ def replace_environment(
             note = f"scene.up has no effect: the scene's {plugin} has an orientation of its own"
 
     # ---- Only the rotation counts: a uniform scale has no meaning at infinity
-    rotation = matrix[:3, :3]
-    size = np.cbrt(np.linalg.det(rotation)) if np.isfinite(rotation).all() else 0.0
-    rotation = rotation / size if size > 0 else rotation
-    if not size > 0 or np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-4:
+    rotation = rotations.rotation_in(matrix[:3, :3], _ROUNDING)
+    if rotation is None:
         raise InputError(
             f"{place}: to_world of the environment emitter stretches, shears or "
             "mirrors; expected a rotation (the axis of <rotate> has length 1)"
@@ -186,8 +210,7 @@ def set_film(state: mi.parser.ParserState, where: str, sensor: int, width: int, 
     The size is that of the picture: of the crop, where the film has one, which keeps its part of the film to
     half a pixel. May move the scene's nodes in memory, as :func:`append`.
     """
-    inside = [v.index() for _, v in state.nodes[sensor].props.items() if _is_reference(v)]
-    films = [i for i in inside if state.nodes[i].type == mi.ObjectType.Film]
+    films = inside(state, state.nodes[sensor], mi.ObjectType.Film)
     if not films:
         films = [append(state, mi.ObjectType.Film, "hdrfilm", sensor)]  # what Mitsuba takes
     place = place_of(state, state.nodes[films[0]], where)
@@ -225,23 +248,16 @@ def _of_aspect(width, height, own_width, own_height):
     )
 
 
-def _is_reference(value):
-    return isinstance(value, mi.Properties.ResolvedReference)
-
-
 def set_sampler(state: mi.parser.ParserState, sensor: int, plugin: str) -> None:
     """Give a sensor, a node's index, a sampler of the asked kind, unless it has another than ``independent``.
 
     May move the scene's nodes in memory: nodes and properties taken from ``state`` before are void.
     """
-    for _, value in state.nodes[sensor].props.items():
-        if _is_reference(value):
-            node = state.nodes[value.index()]
-            if node.type == mi.ObjectType.Sampler:
-                if node.props.plugin_name() == "independent":
-                    node.props.set_plugin_name(plugin)
-                return
-    append(state, mi.ObjectType.Sampler, plugin, sensor)
+    samplers = inside(state, state.nodes[sensor], mi.ObjectType.Sampler)
+    if not samplers:
+        append(state, mi.ObjectType.Sampler, plugin, sensor)
+    elif (props := state.nodes[samplers[0]].props).plugin_name() == "independent":
+        props.set_plugin_name(plugin)
 
 
 def find_file(
@@ -335,15 +351,12 @@ def _matrix(transform: Any, where: str) -> np.ndarray:
 
 
 def _upright(up: str) -> np.ndarray:
-    """Return the rotation ``(3, 3)`` about a coordinate axis that brings an axis to +y."""
-    a = np.array(_AXES[up.removeprefix("-")], float) * (-1 if up.startswith("-") else 1)
-    y = np.array([0.0, 1, 0])
-    v = np.cross(a, y)
-    c = a @ y
-    if c < -0.5:
+    """Return the rotation (3, 3) about a coordinate axis that brings an axis to +y."""
+    if up == "-y":
         return np.diag([1.0, -1, -1])
-    skew = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
-    return np.eye(3) + skew + skew @ skew / (1 + c)
+    axis = np.array(_AXES[up.removeprefix("-")], float) * (-1 if up.startswith("-") else 1)
+    turn = rotations.rotation_between(axis, np.array([0.0, 1, 0]))
+    return np.round(rotations.rotation_matrix(turn))
 
 
 # ---- Digest ------------------------------------------------------------------------------------------------

@@ -28,6 +28,8 @@ _MOST_SAMPLES = 2**32 - 1  # of a wavefront of Mitsuba's
 class PathTracer:
     """Render a map with path replay backpropagation (Vicini et al. 2021, Mitsuba's ``prb``).
 
+    ConfigError if there are more samples than Mitsuba can trace at once.
+
     Parameters
     ----------
     scene : Scene
@@ -42,11 +44,6 @@ class PathTracer:
         gradient.
     one_thread : bool
         Trace gradients by one thread, so that their sums have a fixed order; else by all.
-
-    Raises
-    ------
-    ConfigError
-        There are more samples than Mitsuba can trace at once.
     """
 
     transport = None

@@ -27,14 +27,10 @@ def illuminating(scene: Scene, view: int, x: float, y: float) -> np.ndarray:
     It maximises cos(angle to the normal) times the share of directions within :data:`CLEARANCE_DEGREES` in
     which no object stands: the shading normal, where nothing is in the way.
 
-    Parameters and return value are those of :func:`.highlight.direction`.
-
-    Raises
-    ------
-    NoPlaceError
-        No surface is seen there, it only reflects as a mirror, or no part of the map is seen from it.
+    Parameters and return value are those of :func:`.highlight.direction`. NoPlaceError if no surface is seen
+    there, it only reflects as a mirror, or no part of the map is seen from it.
     """
-    surface, normal, _ = _surface(scene, view, x, y)
+    surface, normal, _ = shadow.surface_at(scene, view, x, y)
     scatters = int(mi.BSDFFlags.Diffuse | mi.BSDFFlags.Glossy)
     if not surface.bsdf().flags().numpy()[0] & scatters:
         raise NoPlaceError("the surface only mirrors: use Move highlight")
@@ -53,14 +49,10 @@ def rimming(scene: Scene, view: int, x: float, y: float) -> np.ndarray:
     tangent plane: what lies between the place and the silhouette faces the light. It is the direction closest
     to that behind the place with no object within :data:`CLEARANCE_DEGREES`, such as a floor.
 
-    Parameters and return value are those of :func:`.highlight.direction`.
-
-    Raises
-    ------
-    NoPlaceError
-        No surface is seen there, it faces the camera, or objects are in the way.
+    Parameters and return value are those of :func:`.highlight.direction`. NoPlaceError if no surface is seen
+    there, it faces the camera, or objects are in the way.
     """
-    surface, normal, eye = _surface(scene, view, x, y)
+    surface, normal, eye = shadow.surface_at(scene, view, x, y)
     grazing = np.radians(GRAZING_DEGREES)
     away = (eye @ normal) * normal - eye  # the tangent away from the camera
     if np.linalg.norm(away) <= np.sin(grazing):
@@ -81,14 +73,10 @@ def shading(scene: Scene, view: int, x: float, y: float, light: np.ndarray | Non
     where nothing fills all, it is the one closest to ``light`` (3,), where the light stands in the frame of
     the map; without it the one closest to the normal.
 
-    Other parameters and the return value are those of :func:`.highlight.direction`.
-
-    Raises
-    ------
-    NoPlaceError
-        No surface is seen there, or no object stands above it.
+    Other parameters and the return value are those of :func:`.highlight.direction`. NoPlaceError if no
+    surface is seen there, or no object stands above it.
     """
-    surface, normal, _ = _surface(scene, view, x, y, smooth=False)  # facets do not shade one another
+    surface, normal, _ = shadow.surface_at(scene, view, x, y, smooth=False)  # facets do not shade one another
     toward = _hemisphere(normal)
     above = (toward @ scene.to_world[:, 1] > 0) & (toward @ normal > np.sin(np.radians(COVER_DEGREES)))
     covered = above * _share_within(toward, above & _blocked(scene, surface, toward), COVER_DEGREES)
@@ -96,16 +84,6 @@ def shading(scene: Scene, view: int, x: float, y: float, light: np.ndarray | Non
         raise NoPlaceError("no object stands above the place: none can cast a shadow there")
     closeness = toward @ (normal if light is None else scene.to_world @ np.float64(light))
     return scene.to_world.T @ toward[np.argmax(np.where(covered == covered.max(), closeness, -np.inf))]
-
-
-def _surface(scene, view, x, y, smooth=True):
-    """Return the surface at a place, its normal on the camera's side, and the direction of the camera."""
-    surface = shadow.surfaces_seen(scene, view, np.array([[x, y]]))
-    if not surface.is_valid().numpy()[0]:
-        raise NoPlaceError("no surface is seen there")
-    vectors = surface.sh_frame.n if smooth else surface.n, surface.to_world(surface.wi)
-    normal, eye = (vector.numpy()[:, 0].astype(np.float64) for vector in vectors)
-    return surface, normal * (1.0 if normal @ eye >= 0 else -1.0), eye
 
 
 def _hemisphere(normal):

@@ -12,7 +12,7 @@ from envedit.scene.scene import Scene
 
 MOST_BYTES = 500_000_000
 """Size above which renderings that were not used for longest are dropped."""
-_RECIPE = 2  # raise when the same inputs give another rendering
+_RECIPE = 3  # raise when the same inputs give another rendering
 
 
 def rendered(
@@ -33,17 +33,16 @@ def rendered(
         "samples": [spp, seed, exactly],
     }
     size = scene.height, scene.width
-
-    def whole(arrays):
-        of_noise = (0,) if arrays["noise"].size == 0 else size
-        kept = {"picture": ("f4", (*size, 3)), "spp": ("i8", ()), "noise": ("f8", of_noise)}
-        return holds(arrays, kept) and arrays["spp"] > 0
+    kept: dict[str, tuple] = {"picture": ("f4", (*size, 3)), "spp": ("i8", ())}
+    if isinstance(spp, str):
+        kept["noise"] = "f8", size
 
     # ---- From disk, or rendered and stored
-    if (stored_arrays := cache.load(key, whole)) is not None:
-        noise = np.array(stored_arrays["noise"]) if stored_arrays["noise"].size else None
-        return np.array(stored_arrays["picture"]), int(stored_arrays["spp"]), noise
+    stored = cache.load(key, lambda arrays: holds(arrays, kept) and bool(arrays["spp"] > 0))
+    if stored is not None:
+        noise = np.array(stored["noise"]) if "noise" in stored else None
+        return np.array(stored["picture"]), int(stored["spp"]), noise
     picture, taken, noise = scene.sampled(envmap, spp, seed, exactly)
-    stored = np.zeros(0) if noise is None else noise
-    cache.store(key, {"picture": picture, "spp": np.array(taken, np.int64), "noise": stored})
+    arrays = {"picture": picture, "spp": np.array(taken, np.int64)}
+    cache.store(key, arrays if noise is None else arrays | {"noise": noise})
     return picture, taken, noise

@@ -140,30 +140,15 @@ class Scene:
         return tuple(view.rows for view in self.views)
 
     def view(self, identifier: int | str, key: str) -> int:
-        """Return the index of a view by index or name.
-
-        Raises
-        ------
-        ConfigError
-            There is none; ``key`` is what asked for it.
-        """
+        """Return the index of a view by index or name; ConfigError, which names ``key``, if there is none."""
         names = [view.name for view in self.views]
         return supported.index_of(identifier, names, names, f"{key}: got view", "; see [scene] sensors")
 
     def set_envmap(self, image: ArrayLike) -> None:
-        """Light the scene by a map.
+        """Light the scene by a map (H, W, 3) of linear radiance, of any resolution.
 
-        Parameters
-        ----------
-        image : array (H, W, 3)
-            Linear radiance, finite and not negative; any resolution, also another than before.
-
-        Raises
-        ------
-        InputError
-            If the shape is not that of a map.
-        NumericalError
-            If a texel is not finite or is negative in float32; one such texel spoils every lit pixel.
+        InputError if the shape is not that of a map. NumericalError if a texel is not finite or is negative
+        in float32: one such texel spoils every lit pixel.
         """
         require_unmasked(image, "environment map")
         image = np.asarray(image)
@@ -304,7 +289,7 @@ def load(
     file: FilePath | dict,
     width: int | None = None,
     height: int | None = None,
-    parameters: Mapping[str, object] | None = None,
+    parameters: Mapping[str, Any] | None = None,
     base: FilePath | None = None,
     sampler: str = "multijitter",
     sensors: str | Sequence[int | str] = (0,),
@@ -312,6 +297,11 @@ def load(
     scale: float | str = "auto",
 ) -> Scene:
     """Load a scene and make its environment emitter replaceable; it gets one if it has none.
+
+    ``parameters``, ``base`` and ``sensors`` are those of :func:`.api.load_scene`. The scene is lit by a grey
+    map until :meth:`Scene.set_envmap` or :meth:`Scene.render` sets another. ConfigError if a parameter or
+    sensor is unknown, missing or unusable, or the size is. InputError if files are missing or damaged, the
+    scene has several environment emitters, or something that is not supported; all that is found is named.
 
     Parameters
     ----------
@@ -321,33 +311,13 @@ def load(
         first), or a dict as ``mi.load_dict`` takes it.
     width, height : int, optional
         Size of the rendering in pixels. None or 0: the scene's own, or by its aspect if one of both is given.
-    parameters : dict, optional
-        Values for the ``$names`` of the XML.
-    base : path, optional
-        Folder for relative file names that are not beside the XML, such as a mesh in ``parameters``.
-        Default: the working folder.
     sampler : str
         Sampler of Mitsuba's renderings, where the scene has none or ``independent``. Stratified
         samples, 256 a pixel, have 8 dB less noise than as many independent ones in the shipped scenes.
-    sensors : "all" or sequence of int and str
-        Indices or ids of the sensors whose pictures a rendering consists of; all of one width.
     up : str
         Axis of the map's zenith, as of :func:`.parser.replace_environment`.
     scale : float or "auto"
         What maps are multiplied by, in place of the ``scale`` of the emitter.
-
-    Returns
-    -------
-    Scene
-        Lit by a grey map until :meth:`Scene.set_envmap` or :meth:`Scene.render` sets another.
-
-    Raises
-    ------
-    ConfigError
-        If a parameter or sensor is unknown, missing or unusable, or the size is.
-    InputError
-        If files are missing or damaged, the scene has several environment emitters, or something that is not
-        supported; all that is found of it is named.
     """
     if not (mi.variant() or "").endswith("_rgb"):
         raise ConfigError(f"variant: got {mi.variant()}, expected one that ends in _rgb, such as llvm_ad_rgb")
@@ -374,14 +344,7 @@ def load(
             parser.set_film(state, where, sensor, width, height)
     with refused.collected():
         emitter, to_world, turned = parser.replace_environment(state, where, up)
-    for node in state.nodes:
-        with refused.collected():
-            parser.smooth_limit(state, node)
-    _find_files(state, where, folders, refused)
-    for node in state.nodes:
-        with refused.collected():
-            parser.fit_to_stage(state, node)
-    refused.raise_all()
+    _change_nodes(state, where, folders, refused)
 
     # ---- Notes, files and digest
     first = usd.kept(path).notes if path is not None and usd.is_usd(path) else ()
@@ -404,15 +367,12 @@ def load(
     # ---- Build
     # On one thread Mitsuba waits for ever for an EXR texture; libjpeg prints about odd textures.
     with film.threads(max(2, dr.thread_count())), quiet_libraries():
-        built = parser.called(where, mi.parser.instantiate, config, state)
-    scene = built[0] if isinstance(built, list | tuple) else built
+        scene = parser.instantiated(config, state, where)
     if scene.environment() is None or scene.environment().id() != name:
         raise InputError(f"{where}: a ready-made environment emitter cannot be replaced; give its dict")
     params = mi.traverse(scene)
     key = next(k for k, _ in params if k.split(".")[-2:] == [name, "data"])
     columns, views = views_of(scene, names)
-    rows = views[-1].rows.stop
-    filled: dict[str, Any] = dict(parameters or {})
 
     def again(width: int, height: int) -> Scene:
         return load(file, width, height, parameters, base, sampler, sensors, up, scale)
@@ -421,7 +381,7 @@ def load(
         scene,
         path,
         columns,
-        rows,
+        views[-1].rows.stop,
         key,
         to_world,
         digest.hexdigest(),
@@ -432,7 +392,7 @@ def load(
         rr_depth=integrator.rr_depth,
         hide_emitters=integrator.hide_emitters,
         notes=notes,
-        parameters=filled,
+        parameters=dict(parameters or {}),
         again=again,
         files=tuple(read),
     )
@@ -463,8 +423,11 @@ class _Refusals:
         raise type(self.errors[0])(f"{lines[0]}\nalso: {lines[1]}")
 
 
-def _find_files(state, where, folders, refused):
-    """Find the files that nodes name; raises what was refused if one of them cannot be read."""
+def _change_nodes(state, where, folders, refused):
+    """Change BSDFs, find the files that nodes name, and fit shapes; raises what was refused."""
+    for node in state.nodes:
+        with refused.collected():
+            parser.smooth_limit(state, node)
     files = []
     for node in state.nodes:
         with refused.collected():
@@ -472,7 +435,11 @@ def _find_files(state, where, folders, refused):
                 files.append(file)
     with refused.collected():
         refused.errors += scene_files.errors(files)
-    refused.raise_all()  # nothing of them is loaded
+    refused.raise_all()  # no file is loaded
+    for node in state.nodes:
+        with refused.collected():
+            parser.fit_to_stage(state, node)
+    refused.raise_all()
 
 
 def views_of(scene: mi.Scene, names: Sequence[str]) -> tuple[int, tuple[View, ...]]:
@@ -515,15 +482,13 @@ def _parsed(file, parameters, base):
             raise wrong[0]
         with installed_plugins.restored():
             state = parser.called(where, mi.parser.parse_file, config, str(text), **filled)
-    scene_text.check_references(state, where)
+    parser.check_references(state, where)
     parser.called(where, mi.parser.transform_all, config, state)
-    parser.lower_names(state)
     installed_plugins.come_first()
     refused = _Refusals()
     for node in state.nodes:
         with refused.collected():
-            installed_plugins.check(node.props.plugin_name(), parser.place_of(state, node, where))
-            parser.check_required(state, node, where)
+            parser.check_plugin(state, node, where)
     refused.raise_all()  # nothing else is loaded
     return config, state, path, where, folders
 
@@ -540,23 +505,13 @@ def relit(
 
     Film, sampler, integrator and all sensors stay; parameters are filled in, files named by absolute paths,
     and what plain Mitsuba does not know (``fit_height``, names in capitals) is written out. The environment
-    emitter becomes an ``envmap`` with the rotation and ``scale`` of :func:`load`, or one is added; a scene
-    without an integrator gets ``path``.
-
-    Parameters
-    ----------
-    file, parameters, base, up, scale
-        As of :func:`load`.
-    envmap : str
-        Name of the map's file, as it shall stand in the XML.
+    emitter becomes an ``envmap`` of the file ``envmap``, as it shall stand in the XML, with the rotation and
+    ``scale`` of :func:`load`, or one is added; a scene without an integrator gets ``path``.
     """
     _, state, _, where, folders = _parsed(file, parameters, base)
     own = supported.own_map(state, where, folders, scale)
     emitter, _, _ = parser.replace_environment(state, where, up)
-    _find_files(state, where, folders, _Refusals())
-    for node in state.nodes:
-        parser.smooth_limit(state, node)
-        parser.fit_to_stage(state, node)
+    _change_nodes(state, where, folders, _Refusals())
     emitter["filename"] = envmap
     emitter["scale"] = own.scale
     supported.ensure_integrator(state)
@@ -574,13 +529,12 @@ def find(file: FilePath) -> Path:
     name = path.name.removesuffix(".xml")
     bare = path.name == str(file)
     names = shipped.scenes()
-    if bare and name in names and (folder := shipped.folder()):
-        return folder / f"{name}.xml"
+    if bare and name in names:
+        return shipped.folder() / f"{name}.xml"
     if os.path.isdir(path):
         raise InputError(f"scene {file}: this is a folder, expected a Mitsuba XML or USD file")
     close = difflib.get_close_matches(name, names, 1) if bare else []
-    known = ", ".join(names) or "none: install envedit again"
-    expected = f"expected a Mitsuba XML or USD file or one of {known}"
+    expected = f"expected a Mitsuba XML or USD file or one of {', '.join(names)}"
     hint = f"did you mean {close[0]}?" if close else expected
     raise InputError(f"scene {file}: no such file; {hint}")
 

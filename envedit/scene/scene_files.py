@@ -61,14 +61,8 @@ class SceneFile(NamedTuple):
 def errors(files: Sequence[SceneFile]) -> list[InputError]:
     """Return what is wrong with files; no error holds text out of one.
 
-    Files of the package, those of other plugins, and those whose content is known are not tried.
-
-    Raises
-    ------
-    InputError
-        A file cannot be read from the disk, or is larger than 4 GiB.
-    MachineError
-        No other process can be started.
+    Files of the package, those of other plugins, and those whose content is known are not tried. InputError
+    if a file cannot be read from the disk, or is larger than 4 GiB; MachineError if no other process starts.
     """
     store = DiskCache(cache_folder("scene_files"), _REMEMBERED_BYTES)
     unknown: dict[str, SceneFile] = {}
@@ -78,15 +72,14 @@ def errors(files: Sequence[SceneFile]) -> list[InputError]:
             if key not in _remembered and store.load({"good": key}) is None:
                 unknown[key] = file
     wrong = []
-    while unknown:
-        for answer in _answers([*unknown.values()]):  # the others are tried again if a file has none
-            key = next(iter(unknown))
+    while unknown:  # files without an answer are tried again
+        for key, answer in zip([*unknown], _answers([*unknown.values()]), strict=False):
             path = unknown.pop(key).path
             if answer:
                 wrong.append(InputError(f"{path}: {answer}"))
-                continue
-            _remembered.add(key)
-            store.store({"good": key}, {})
+            else:
+                _remembered.add(key)
+                store.store({"good": key}, {})
     return wrong
 
 
@@ -115,12 +108,7 @@ def lines_of(
 
     It writes a first line as soon as it has begun. ``arguments`` are those of its ``main``, as JSON knows
     them, ``seconds`` the processor time that it allows itself, and ``environment`` more variables of its
-    environment.
-
-    Raises
-    ------
-    MachineError
-        It cannot be started.
+    environment. MachineError if it cannot be started.
     """
     try:
         output = subprocess.run(

@@ -61,37 +61,11 @@ class Outline:
 def read(path: Path, parameters: dict[str, str]) -> Outline:
     """Read a scene and all that it includes, with the values given for its ``$names``.
 
-    Raises
-    ------
-    InputError
-        If a file cannot be read, is no XML, or goes beyond a bound; naming file and line.
+    InputError if a file cannot be read, is no XML, or goes beyond a bound; naming file and line.
     """
     reader = _Reader(dict(parameters))
     reader.file(Path(path), [str(folder) for folder in mi.file_resolver()], [])
     return reader.outline
-
-
-def check_references(state: mi.parser.ParserState, where: str) -> None:
-    """Refuse a parsed scene whose objects refer to one another too deeply for Mitsuba's recursion.
-
-    Raises
-    ------
-    InputError
-        If a chain is longer than :data:`DEEPEST`, or a circle.
-    """
-    ids = dict(state.id_to_index)
-    below = []
-    for node in state.nodes:
-        values = [value for _, value in node.props.items()]
-        named = {ids.get(value.id()) for value in values if isinstance(value, mi.Properties.Reference)}
-        held = {value.index() for value in values if isinstance(value, mi.Properties.ResolvedReference)}
-        below.append({index for index in named | held if index is not None})
-    # Those at the end of a chain of one more reference, in each round.
-    ends = set(range(len(below)))
-    for _ in range(DEEPEST):
-        ends = {child for node in ends for child in below[node]}
-    if ends:
-        raise InputError(f"{where}: objects refer to one another in a circle, or more than {DEEPEST} deep")
 
 
 class _Reader:
@@ -113,16 +87,14 @@ class _Reader:
                     raise _WrongError("a DOCTYPE is not read; remove it")
                 if token["odd"]:
                     raise _WrongError("a tag is not well formed")
-                if not token["tag"]:
-                    continue
                 if token["closing"]:
                     depth -= 1
-                    continue
-                self._spend(_ELEMENT)
-                depth += not token["attributes"].endswith("/")
-                if depth > DEEPEST:
-                    raise _WrongError(f"more than {DEEPEST} elements inside one another")
-                self._tag(token["tag"], token["attributes"], folders, [*above, name])
+                elif token["tag"]:
+                    self._spend(_ELEMENT)
+                    depth += not token["attributes"].endswith("/")
+                    if depth > DEEPEST:
+                        raise _WrongError(f"more than {DEEPEST} elements inside one another")
+                    self._tag(token["tag"], token["attributes"], folders, [*above, name])
         except _WrongError as error:
             line = text.count("\n", 0, place) + 1
             raise InputError(f"scene {name}, line {line}: {error}") from None

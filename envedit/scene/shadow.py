@@ -20,12 +20,8 @@ def occluder(scene: Scene, view: int, x: float, y: float, toward: np.ndarray) ->
     """Return the point that keeps a light from a place of a view, (3,) float64 in the scene's coordinates.
 
     It is the first that a ray from there ``toward`` the light, a direction (3,) in the frame of the map,
-    hits. Other parameters are those of :func:`.highlight.direction`.
-
-    Raises
-    ------
-    NoPlaceError
-        No surface is seen there, it faces away from the light, or nothing is between both.
+    hits. Other parameters are those of :func:`.highlight.direction`. NoPlaceError if no surface is seen
+    there, it faces away from the light, or nothing is between both.
     """
     rows = scene.rows[view]
     offset = NEAR / [scene.width, rows.stop - rows.start]
@@ -51,22 +47,29 @@ def direction(scene: Scene, view: int, x: float, y: float, point: np.ndarray) ->
     """Return where a light must stand for the shadow of a point to lie at a place of a view.
 
     ``point`` (3,) is what :func:`occluder` returned; other parameters and the return value are those of
-    :func:`.highlight.direction`.
+    :func:`.highlight.direction`. NoPlaceError if no surface is seen there, or it faces away from the point.
+    """
+    surface, normal, _ = surface_at(scene, view, x, y, smooth=False)
+    toward = np.float64(point) - surface.p.numpy()[:, 0]
+    if toward @ normal <= 0:
+        raise NoPlaceError("the surface faces away from what casts the shadow")
+    light = scene.to_world.T @ toward
+    return light / np.linalg.norm(light)
 
-    Raises
-    ------
-    NoPlaceError
-        No surface is seen there, or it faces away from the point.
+
+def surface_at(
+    scene: Scene, view: int, x: float, y: float, smooth: bool = True
+) -> tuple[mi.SurfaceInteraction3f, np.ndarray, np.ndarray]:
+    """Return the surface at a place, its normal on the camera's side, and the direction of the camera, (3,).
+
+    ``smooth``: the shading normal, not that of the facet. NoPlaceError if no surface is seen there.
     """
     surface = surfaces_seen(scene, view, np.array([[x, y]]))
     if not surface.is_valid().numpy()[0]:
         raise NoPlaceError("no surface is seen there")
-    toward = np.float64(point) - surface.p.numpy()[:, 0]
-    normal, eye = (v.numpy()[:, 0] for v in (surface.n, surface.to_world(surface.wi)))
-    if (toward @ normal) * (eye @ normal) <= 0:
-        raise NoPlaceError("the surface faces away from what casts the shadow")
-    light = scene.to_world.T @ toward
-    return light / np.linalg.norm(light)
+    vectors = surface.sh_frame.n if smooth else surface.n, surface.to_world(surface.wi)
+    normal, eye = (vector.numpy()[:, 0].astype(np.float64) for vector in vectors)
+    return surface, normal * (1.0 if normal @ eye >= 0 else -1.0), eye
 
 
 def surfaces_seen(scene: Scene, view: int, places: np.ndarray) -> mi.SurfaceInteraction3f:

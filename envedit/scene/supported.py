@@ -18,8 +18,8 @@ import numpy as np
 
 from envedit.core import shipped
 from envedit.core.errors import ConfigError, InputError
+from envedit.scene import parser
 from envedit.scene.own_light import OwnLight
-from envedit.scene.parser import append, environment, place_of
 
 SENSORS = ("perspective", "thinlens", "orthographic")
 """Sensors whose rays make a picture; others are refused."""
@@ -63,19 +63,12 @@ def own_map(
 ) -> OwnMap:
     """Read what the scene's environment emitter gives, before it is replaced.
 
-    Parameters
-    ----------
-    scale : float or "auto"
-        In place of the emitter's.
-
-    Raises
-    ------
-    InputError
-        There are several, or ``scale`` is not a finite number above 0.
+    ``scale`` takes the place of the emitter's. InputError if there are several emitters, or the emitter's own
+    scale is not a finite number above 0.
     """
     # ---- No emitter, or one that is no map
     factor = 1.0 if isinstance(scale, str) else scale
-    index = environment(state, where)
+    index = parser.environment(state, where)
     if index is None:
         emitter = '<emitter type="envmap"><string name="filename" value="FILE"/></emitter> inside <scene>'
         if where.lower().endswith(shipped.USD_ENDINGS):
@@ -83,24 +76,20 @@ def own_map(
         missing = f"{where}: no environment emitter: add {emitter}, {_GIVE_MAP}"
         note = "no environment emitter: the map lights the scene beside its own lamps"
         return OwnMap(None, factor, (note,), missing=missing, added=True)
-    node = state.nodes[index]
-    place = place_of(state, state.nodes[index], where)
-    props = node.props
-    plugin = node.props.plugin_name()
-    if plugin != "envmap":
-        if plugin == "constant" and props.id() == PLACEHOLDER:
-            return OwnMap(None, factor)
+    props = state.nodes[index].props
+    if props.plugin_name() == "constant" and props.id() == PLACEHOLDER:
+        return OwnMap(None, factor)
+    if props.plugin_name() != "envmap":
         return OwnMap(None, factor, light=OwnLight.of(state, index, where))
+    place = parser.place_of(state, state.nodes[index], where)
 
     # ---- Scale and rotation
     own: Any = props.get("scale", 1.0)
     number = isinstance(own, int | float) and not isinstance(own, bool)
     if not number or not math.isfinite(own) or not 0 < float(np.float32(own)) < math.inf:
         raise InputError(f"{place}: scale of the environment map is {own}, expected a number above 0")
-    matrix = getattr(props.get("to_world", None), "matrix", None)
-    size = 1.0
-    if matrix is not None:
-        size = float(np.linalg.norm(np.array(matrix, np.float64).reshape(4, 4)[:3, 0]))
+    matrix = getattr(props.get("to_world", None), "matrix", np.eye(4))
+    size = float(np.linalg.norm(np.array(matrix, np.float64).reshape(4, 4)[:3, 0]))
     notes = []
     if np.isfinite(size) and abs(size - 1) > _ROUNDING:
         notes.append(
@@ -136,11 +125,8 @@ class Integrator:
 def take_integrator(state: mi.parser.ParserState, where: str) -> Integrator:
     """Read what the integrator asks for and put ``path`` in its place, so that it is never built.
 
-    Raises
-    ------
-    InputError
-        The scene has a participating medium and an integrator that would render it, or ``max_depth`` or
-        ``rr_depth`` is out of range.
+    InputError if the scene has a participating medium and an integrator that would render it, or if
+    ``max_depth`` or ``rr_depth`` is out of range.
     """
     # ---- The integrator inside all wrappers
     for n in state.nodes:  # of a dict, the parser does not know the type of a plugin written in Python
@@ -152,30 +138,27 @@ def take_integrator(state: mi.parser.ParserState, where: str) -> Integrator:
     while node is not None and node.props.plugin_name() in WRAPPERS:
         if node.props.plugin_name() == "stokes":
             notes.append("integrator stokes: rendered without polarisation")
-        inside = [n for n in _references(state, node) if n.type == mi.ObjectType.Integrator]
-        if not inside:
+        wrapped = parser.inside(state, node, mi.ObjectType.Integrator)
+        if not wrapped:
             break
-        node = inside[0]
+        node = state.nodes[wrapped[0]]
 
     # ---- Its path depth, Russian roulette and hidden emitters
-    name = "path"
-    depth = -1
-    roulette = ROULETTE
-    hide = False
-    if node is not None:
-        props, name = node.props, node.props.plugin_name()
-        hide = props.get("hide_emitters", False) is True
-        if name in DIRECT:
-            depth = 2
-        elif name in PATHS + VOLUMES:
-            depth, roulette = props.get("max_depth", -1), props.get("rr_depth", ROULETTE)
-        else:
-            notes.append(f"integrator {name} is not used: rendered by path, with paths of any length")
-        for key, value, expected in (("max_depth", depth, "-1 or "), ("rr_depth", roulette, "")):
-            whole = isinstance(value, int) and not isinstance(value, bool)
-            if not whole or not (value > 0 or expected and value == -1):
-                expected += "a whole number above 0"
-                raise InputError(f"{place_of(state, node, where)}: {key} is {value}, expected {expected}")
+    props = mi.Properties("path") if node is None else node.props
+    name = props.plugin_name()
+    hide = props.get("hide_emitters", False) is True
+    depth, roulette = -1, ROULETTE
+    if name in DIRECT:
+        depth = 2
+    elif name in PATHS + VOLUMES:
+        depth, roulette = props.get("max_depth", -1), props.get("rr_depth", ROULETTE)
+    else:
+        notes.append(f"integrator {name} is not used: rendered by path, with paths of any length")
+    for key, value, expected in (("max_depth", depth, "-1 or "), ("rr_depth", roulette, "")):
+        whole = isinstance(value, int) and not isinstance(value, bool)
+        if not whole or not (value > 0 or expected and value == -1):
+            place = parser.place_of(state, node, where)
+            raise InputError(f"{place}: {key} is {value}, expected {expected}a whole number above 0")
 
     # ---- All give way to path
     _check_media(state, where, name, notes)
@@ -196,10 +179,10 @@ def polarised(state: mi.parser.ParserState) -> tuple[str, ...]:
 
 
 def ensure_integrator(state: mi.parser.ParserState) -> None:
-    """Give a scene without an integrator ``path``; may move its nodes, as :func:`.append`."""
+    """Give a scene without an integrator ``path``; may move its nodes, as :func:`.parser.append`."""
     if any(n.type == mi.ObjectType.Integrator for n in state.nodes):
         return
-    append(state, mi.ObjectType.Integrator, "path")
+    parser.append(state, mi.ObjectType.Integrator, "path")
 
 
 def _check_media(state, where, integrator, notes):
@@ -210,7 +193,7 @@ def _check_media(state, where, integrator, notes):
     kind = media[0].props.plugin_name()
     if integrator in VOLUMES:
         raise InputError(
-            f"{place_of(state, media[0], where)}: participating medium ({kind}): envedit renders "
+            f"{parser.place_of(state, media[0], where)}: participating medium ({kind}): envedit renders "
             "surfaces only; remove the medium from the scene"
         )
     notes.append(f"medium {kind} is not rendered, as the scene's integrator ({integrator}) has no media")
@@ -221,26 +204,9 @@ def take_sensors(
 ) -> tuple[list[int], list[str], tuple[str, ...]]:
     """Choose the sensors whose pictures are edited, in the order asked for; the scene has no others then.
 
-    Parameters
-    ----------
-    selection : "all" or sequence of int and str
-        Indices and ids.
-
-    Returns
-    -------
-    nodes : list of int
-        Indices of their nodes.
-    names : list of str
-        Their ids, or ``sensor N`` where one has none.
-    notes : tuple of str
-        Which of several are used, and which not.
-
-    Raises
-    ------
-    ConfigError
-        There is no such sensor, or one is asked for twice.
-    InputError
-        One is of a kind that makes no picture.
+    ``selection`` is "all", or indices and ids. Returns the indices of their nodes; their ids, or ``sensor N``
+    where one has none; and notes, which of several are used and which not. ConfigError if there is no such
+    sensor or one is asked for twice, InputError if one is of a kind that makes no picture.
     """
     # ---- Choose
     sensors = [i for i, n in enumerate(state.nodes) if n.type == mi.ObjectType.Sensor]
@@ -257,10 +223,9 @@ def take_sensors(
     for i in nodes:
         kind = state.nodes[i].props.plugin_name()
         if kind not in SENSORS:
-            raise InputError(
-                f"{place_of(state, state.nodes[i], where)}: sensor {kind} makes no picture to edit by; "
-                f"expected {', '.join(SENSORS)}"
-            )
+            place = parser.place_of(state, state.nodes[i], where)
+            expected = ", ".join(SENSORS)
+            raise InputError(f"{place}: sensor {kind} makes no picture to edit by; expected {expected}")
     names = [ids[k] or f"sensor {k}" for k in chosen]
     if len(sensors) == 1:
         return nodes, names, ()
@@ -279,13 +244,7 @@ def take_sensors(
 
 
 def require_one_sensor(state: mi.parser.ParserState, where: str) -> None:
-    """Refuse a scene with several sensors of which none was chosen.
-
-    Raises
-    ------
-    ConfigError
-        There are several; it names them.
-    """
+    """Refuse a scene with several sensors of which none was chosen, with a ConfigError that names them."""
     names = [n.props.id() for n in state.nodes if n.type == mi.ObjectType.Sensor]
     if len(names) > 1:
         known = ", ".join(names[:8]) + (", ..." if len(names) > 8 else "")
@@ -294,12 +253,9 @@ def require_one_sensor(state: mi.parser.ParserState, where: str) -> None:
 
 
 def index_of(identifier: int | str, names: list[str], shown: list[str], prefix: str, more: str = "") -> int:
-    """Return the index of what is asked for by index or name; ``shown`` is what an error lists.
+    """Return the index of what is asked for by index or name.
 
-    Raises
-    ------
-    ConfigError
-        There is none; its text begins with ``prefix`` and ends with ``more``.
+    ConfigError if there is none: its text begins with ``prefix``, lists ``shown`` and ends with ``more``.
     """
     if identifier in names:
         return names.index(identifier)
@@ -311,23 +267,13 @@ def index_of(identifier: int | str, names: list[str], shown: list[str], prefix: 
 
 def _keep_only(state, nodes):
     """Let the scene refer to these sensors only, in this order."""
-    references = {}
     for node in state.nodes:
-        for name, value in list(node.props.items()):
-            if not isinstance(value, mi.Properties.ResolvedReference):
-                continue
-            if state.nodes[value.index()].type == mi.ObjectType.Sensor:
-                references[value.index()] = value
+        for name, i in parser.references(node).items():
+            if state.nodes[i].type == mi.ObjectType.Sensor:
                 del node.props[name]
     for k, i in enumerate(nodes):
-        state.root.props[f"view_{k}_of_{len(nodes)}"] = references[i]
+        state.root.props[f"view_{k}_of_{len(nodes)}"] = mi.Properties.ResolvedReference(i)
 
 
 def _name(node):
     return f"{node.props.plugin_name()} {node.props.id()}".strip()
-
-
-def _references(state, node):
-    """List the nodes that a node refers to."""
-    values = [value for _, value in node.props.items()]
-    return [state.nodes[v.index()] for v in values if isinstance(v, mi.Properties.ResolvedReference)]

@@ -38,11 +38,7 @@ def read_sky(world: bpy.types.World | None) -> Sky:
 
     Read are an *Environment Texture* (equirectangular) of a file, in the *Background* of the output; at
     its Vector a *Mapping* that only rotates; at its Color a *Vector Math* node, Multiply by equal numbers.
-
-    Raises
-    ------
-    ExchangeError
-        There is no world, or it has other nodes.
+    ExchangeError if there is no world, or it has other nodes.
     """
     if world is None or world.node_tree is None:
         raise ExchangeError("the scene has no world with nodes: give it one with an Environment Texture")
@@ -94,21 +90,10 @@ def _only_rotates(node):
 
 
 def export(scene: bpy.types.Scene, file: Path, camera: bpy.types.Object | None = None) -> None:
-    """Write a USD file of what one camera sees; afterwards the scene is as before.
+    """Write a USD file of what one camera, by default the scene's, sees; afterwards the scene is as before.
 
-    Parameters
-    ----------
-    scene : bpy.types.Scene
-        The scene of the context.
-    file : Path
-        Textures are copied to ``textures`` beside it.
-    camera : bpy.types.Object, optional
-        By default the scene's.
-
-    Raises
-    ------
-    ExchangeError
-        There is no camera, :func:`read_sky` does not read the world, or Blender cannot write the file.
+    ``scene`` is that of the context. Textures are copied to ``textures`` beside ``file``. ExchangeError if
+    there is no camera, :func:`read_sky` does not read the world, or Blender cannot write the file.
     """
     camera = camera or scene.camera
     if camera is None:
@@ -173,22 +158,11 @@ def _fill(world, sky):
 def take(scene: bpy.types.Scene, results: Path, lamps: bool = False, relative: bool = False) -> None:
     """Set a scene's world to an edited map; its rotation and factor stay.
 
-    Parameters
-    ----------
-    scene : bpy.types.Scene
-        Sun lamps of an earlier take of the same results are removed.
-    results : Path
-        Folder of an ``envedit run``. The map is copied to ``world_1.exr`` and so on beside it: the next save
-        does not change what undo goes back to.
-    lamps : bool
-        Take the lights of the map as sun lamps, and its sky, at working resolution, as the world.
-    relative : bool
-        Name the map relative to the .blend file.
-
-    Raises
-    ------
-    ExchangeError
-        The world or the results cannot be read.
+    ``results`` is the folder of an ``envedit run``. The map is copied to ``world_1.exr`` and so on beside it:
+    the next save does not change what undo goes back to. ``lamps``: take the lights of the map as sun lamps,
+    in place of those of an earlier take of the same results, and its sky, at working resolution, as the
+    world. ``relative``: name the map relative to the .blend file. ExchangeError if the world or the results
+    cannot be read.
     """
     texture = read_sky(scene.world).texture
     names = ("edited_sky.exr",) if lamps else ("edited_full.exr", "edited.exr")

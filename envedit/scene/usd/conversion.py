@@ -50,28 +50,14 @@ def is_usd(file: object) -> bool:
 
 
 def convert(file: FilePath, xml: Path, camera: str = "", time: float | None = None) -> Converted:
-    """Write a USD file as a Mitsuba scene.
+    """Write a USD file as a Mitsuba scene, ``xml``, with ``NAME_files`` beside it; neither may exist.
 
-    Parameters
-    ----------
-    file : path
-        The USD file.
-    xml : Path
-        The scene to write, with ``NAME_files`` beside it; neither may exist.
-    camera : str
-        Path of its camera; "": the only one; "all": every one, each as a sensor with its path as id.
-    time : float, optional
-        Time code of animated values; None: the first of the stage.
+    ``camera`` is the path of a camera; "": the only one; "all": every one, each as a sensor with its path as
+    id. ``time`` is the time code of animated values; None: the first of the stage.
 
-    Raises
-    ------
-    ConfigError
-        There are several cameras and none is chosen, or there is none of that path.
-    InputError
-        The USD file is missing, damaged or declares too much, names missing textures, or has no camera or no
-        surface; or a file is in the way.
-    MachineError
-        The extra ``usd`` is not installed.
+    ConfigError if there are several cameras and none is chosen, or none of that path. InputError if the USD
+    file is missing, damaged or declares too much, names missing textures, or has no camera or no surface, or
+    if a file is in the way. MachineError if the extra ``usd`` is not installed.
     """
     # ---- Refuse what cannot be read or written
     file = Path(file).absolute()
@@ -120,18 +106,15 @@ def kept(file: FilePath) -> Converted:
     Errors are those of :func:`convert`, which is asked for all cameras.
     """
     file = Path(file).absolute()
-    root = cache_folder("usd")
-    if root is None:
-        root = Path(tempfile.mkdtemp(prefix="envedit_usd_"))
+    root = cache_folder("usd") or Path(tempfile.mkdtemp(prefix="envedit_usd_"))
     key = json.dumps([str(file), _digests([str(file)]), _VERSION])
-    name = hashlib.sha256(key.encode()).hexdigest()[:32]
-    folder = root / name
+    folder = root / hashlib.sha256(key.encode()).hexdigest()[:32]
+    xml = folder / f"{file.stem}.xml"
     state = folder / "converted.json"
     with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
         known = json.loads(state.read_text(encoding="utf-8"))
-        if known["sources"] == _digests(known["sources"]) and (folder / f"{file.stem}.xml").is_file():
+        if known["sources"] == _digests(known["sources"]) and xml.is_file():
             os.utime(state)
-            xml = folder / f"{file.stem}.xml"
             return Converted(xml, tuple(known["notes"]), tuple(known["sources"]), known["stage"])
 
     # ---- Made in a folder beside, which takes the place of the old one
@@ -141,25 +124,18 @@ def kept(file: FilePath) -> Converted:
     except OSError as error:
         raise InputError(f"{root}: cannot be written ({error.strerror})") from None
     try:
-        converted = convert(file, draft / f"{file.stem}.xml", "all")
+        converted = convert(file, draft / xml.name, "all")
         known = {"notes": converted.notes, "sources": _digests(converted.sources), "stage": converted.stage}
-        text = json.dumps(known)
-        (draft / state.name).write_text(text, encoding="utf-8")
+        (draft / state.name).write_text(json.dumps(known), encoding="utf-8")
         shutil.rmtree(folder, ignore_errors=True)
         with contextlib.suppress(OSError):  # another process was faster with the same
             os.rename(draft, folder)
     finally:
         shutil.rmtree(draft, ignore_errors=True)
-    for old in sorted(root.glob("*/converted.json"), key=_changed)[:-_KEPT]:
-        shutil.rmtree(old.parent, ignore_errors=True)
-    return converted._replace(xml=folder / f"{file.stem}.xml")
-
-
-def _changed(path):
-    try:
-        return path.stat().st_mtime
-    except OSError:
-        return 0.0
+    with contextlib.suppress(OSError):  # another process deletes some as well
+        for old in sorted(root.glob("*/converted.json"), key=os.path.getmtime)[:-_KEPT]:
+            shutil.rmtree(old.parent, ignore_errors=True)
+    return converted._replace(xml=xml)
 
 
 def _digests(files):

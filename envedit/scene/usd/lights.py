@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from pxr import UsdGeom, UsdLux
 
+from envedit.core import rotations
 from envedit.images import images
 from envedit.scene.usd import assets
 from envedit.scene.usd.description import Description, add
@@ -72,15 +73,13 @@ def _per_size(scene, prim, radiance, size):
 
 def _rotation(scene, prim, to_world):
     """Return the rotation (3, 3) in a transform."""
-    matrix = to_world[:3, :3]
-    determinant = np.linalg.det(matrix)
-    rotation = matrix / np.cbrt(determinant) if determinant > 0 else matrix
-    if not np.abs(rotation @ rotation.T - np.eye(3)).max() <= _ROUNDING or determinant <= 0:
+    rotation = rotations.rotation_in(to_world[:3, :3], _ROUNDING)
+    if rotation is None:
         raise scene.error(
             prim.GetPath(), "the light's transform stretches, shears or mirrors; expected a rotation"
         )
-    left, _, last = np.linalg.svd(rotation)
-    return left @ last
+    left, _, right = np.linalg.svd(rotation)
+    return left @ right
 
 
 # ---- Lights at infinity ------------------------------------------------------------------------------------

@@ -166,15 +166,9 @@ def _texture(scene, surface, shader, output, channels):
         return texture
     picked = list(range(3)) if output == "rgb" else ["rgba".index(output)]
     bitmap = mi.Bitmap(str(scene.folder / file))
-    if bitmap.pixel_format() not in (mi.Bitmap.PixelFormat.RGB, mi.Bitmap.PixelFormat.RGBA):
-        layout = mi.Bitmap.PixelFormat.RGBA if "a" in output else mi.Bitmap.PixelFormat.RGB
-        bitmap = bitmap.convert(layout, bitmap.component_format(), bitmap.srgb_gamma())
     bitmap.set_srgb_gamma(bitmap.srgb_gamma() and not raw)
-    values = np.array(bitmap.convert(bitmap.pixel_format(), mi.Struct.Type.Float32, False))
-    if values.shape[2] <= max(picked):  # no alpha: opaque
-        values = np.concatenate([values, np.ones_like(values[..., :1])], axis=2)
-    values = values[..., picked] * scale[picked] + bias[picked]
-    values = np.clip(values, 0, 1)
+    values = np.array(bitmap.convert(mi.Bitmap.PixelFormat.RGBA, mi.Struct.Type.Float32, False))
+    values = np.clip(values[..., picked] * scale[picked] + bias[picked], 0, 1)
     short = hashlib.sha256(f"{file} {output} {scale} {bias} {raw}".encode()).hexdigest()[:12]
     copy, texture.file = scene.new_file(f"texture_{short}.exr")
     mi.Bitmap(np.repeat(values, 3, axis=2) if len(picked) == 1 else values).write(str(copy))
@@ -220,23 +214,20 @@ def add_bsdf(scene: Description, surface: Surface, name: str) -> None:
     if isinstance(opacity, Texture) or opacity < 1:
         outer = add(outer, "bsdf", "mask")
         _add_value(outer, "opacity", opacity if isinstance(opacity, Texture) else max(opacity, 0.0))
-    transmission = values.get("spec_trans", 0.0)
-    only_diffuse = values.get("eta", 1.0) <= _SMALLEST_ETA and not any(
-        isinstance(value := values.get(key, 0.0), Texture) or value > 0
+    lobes = {
+        key
         for key in ("spec_trans", "metallic", "clearcoat")
-    )
-    if only_diffuse:
-        first = add(outer, "bsdf", "twosided")
-        bsdf = add(first, "bsdf", "diffuse")
-        values = {"reflectance": values["base_color"]}
-    elif isinstance(transmission, Texture) or transmission > 0:
-        bsdf = add(outer, "bsdf", "principled")
-        first = bsdf
-    else:
+        if isinstance(value := values.get(key, 0.0), Texture) or value > 0
+    }
+    if "spec_trans" not in lobes:
+        outer = add(outer, "bsdf", "twosided")
         values.pop("spec_trans", None)
-        first = add(outer, "bsdf", "twosided")
-        bsdf = add(first, "bsdf", "principled")
-    (first if outer is scene.root else outer).set("id", name)
+    if values.get("eta", 1.0) <= _SMALLEST_ETA and not lobes:
+        bsdf = add(outer, "bsdf", "diffuse")
+        values = {"reflectance": values["base_color"]}
+    else:
+        bsdf = add(outer, "bsdf", "principled")
+    scene.root[-1].set("id", name)
 
     # ---- Mitsuba's parameters
     if isinstance(values.get("clearcoat_gloss"), float):

@@ -20,18 +20,9 @@ def triangles(scene: Description, prim: Any, uv_name: str, faces: np.ndarray | N
     """Return a mesh as triangles; polygons are cut into fans.
 
     ``uv_name`` is the primvar of the texture coordinates; "": one of :data:`FIRST_UV`. ``faces`` (n,) says
-    which faces; None: all.
-
-    Returns
-    -------
-    dict
-        ``vertices`` (n, 3), ``normals`` (n, 3) and ``uv`` (n, 2) float32, the last two where the mesh has
-        them, and ``faces`` (m, 3) int32. Mitsuba's rows of a texture go down: v is 1 - USD's.
-
-    Raises
-    ------
-    InputError
-        Its arrays do not fit together.
+    which faces; None: all. Returned are ``vertices`` (n, 3), ``normals`` (n, 3) and ``uv`` (n, 2) float32,
+    the last two where the mesh has them, and ``faces`` (m, 3) int32. Mitsuba's rows of a texture go down: v
+    is 1 - USD's. InputError if the mesh's arrays do not fit together.
     """
     mesh = UsdGeom.Mesh(prim)
     points: np.ndarray = _array(mesh.GetPointsAttr(), scene.time, np.float32).reshape(-1, 3)
@@ -44,8 +35,6 @@ def triangles(scene: Description, prim: Any, uv_name: str, faces: np.ndarray | N
     # ---- Corners of the triangles, as indices into those of the polygons
     starts = np.cumsum(counts) - counts
     kept = np.arange(len(counts)) if faces is None else faces
-    if kept.size and not (kept.min() >= 0 and kept.max() < len(counts)):
-        raise scene.error(prim.GetPath(), "a subset names faces that the mesh does not have")
     holes = _array(mesh.GetHoleIndicesAttr(), scene.time, np.int64)
     kept = kept[~np.isin(kept, holes)]
     each = np.maximum(counts[kept] - 2, 0)
@@ -72,9 +61,8 @@ def triangles(scene: Description, prim: Any, uv_name: str, faces: np.ndarray | N
 
     # ---- Vertices: corners of one point with the same values share one
     rows = np.concatenate(columns, axis=2, dtype=np.float32).reshape(-1, sum(c.shape[2] for c in columns))
-    rows = np.nan_to_num(rows, posinf=0, neginf=0) + np.float32(
-        0
-    )  # no negative zero, so that equal rows are equal bytes
+    rows = np.nan_to_num(rows, posinf=0, neginf=0)
+    rows += np.float32(0)  # no negative zero, so that equal rows are equal bytes
     keys = np.ascontiguousarray(rows).view(f"V{rows.shape[1] * 4}").ravel()
     _, picked, inverse = np.unique(keys, return_index=True, return_inverse=True)
     vertices = rows[picked]

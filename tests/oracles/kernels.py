@@ -1,5 +1,7 @@
 """Which kernels some work launches, and which of them are new."""
 
+import gc
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -28,8 +30,17 @@ def history():
 
 
 def compiled(call):
-    """Do some work and return what :func:`history` counts of it."""
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        dr.kernel_history_clear()
-        call()
-        return history()
+    """Do some work and return what :func:`history` counts of it.
+
+    Arguments of virtual calls are in the order of their variables' numbers. Those that Python's collector
+    frees are given out again: where it collects while a kernel is traced, the kernel is another.
+    """
+    gc.collect()
+    gc.disable()
+    try:
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            dr.kernel_history_clear()
+            call()
+            return history()
+    finally:
+        gc.enable()

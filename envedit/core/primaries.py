@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterable
 
 import numpy as np
@@ -54,8 +55,10 @@ def known(chromaticities: Iterable[float], where: str) -> Chromaticities | None:
         if np.allclose(values, REC709, atol=SAME):
             return None
         columns = _xyz(values)
-        with np.errstate(all="ignore"):
-            share = np.linalg.solve(columns[:, :3], columns[:, 3]) if _area(values) > 1e-6 else np.zeros(3)
+        share = np.zeros(3)
+        if _area(values) > 1e-6:
+            with np.errstate(all="ignore"), contextlib.suppress(np.linalg.LinAlgError):
+                share = np.linalg.solve(columns[:, :3], columns[:, 3])
         if np.isfinite(share).all() and (share > 0).all():
             return values
     shown = ", ".join(f"{v:.4g}" for v in values[:8])

@@ -111,7 +111,7 @@ def test_a_key_goes_before_what_the_file_says(header, tmp_path, rng):
         (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.9, 0.05),  # a white that no mixture of them is
         (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3, 0.0),
         (float("nan"),) * 8,
-        (0, 1e17, 0, 2e17, 1e17, 0, 0.3, 0.3),  # beside which white is nothing: singular
+        (0.0, 1e17, 0.0, 2e17, 1e17, 0.0, 0.3, 0.3),  # beside which white is nothing: singular
     ],
 )
 def test_chromaticities_that_are_no_primaries_are_refused(space, tmp_path, rng):

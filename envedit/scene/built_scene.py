@@ -121,8 +121,10 @@ def wrapped(scene: Any, sensors: str | Sequence[int | str] = "all") -> Scene:
     unique = UNKNOWN + uuid.uuid4().hex
     own = OwnMap(None, scale)
     rows = views[-1].rows.stop
-    paths = _integrator(scene)  # max_depth, rr_depth, hide_emitters and notes
-    return Scene(scene, None, width, rows, key, to_world, unique, params, views, own, *paths)
+    max_depth, rr_depth, hide, notes = _integrator(scene)
+    return Scene(
+        scene, None, width, rows, key, to_world, unique, params, views, own, max_depth, rr_depth, hide, notes
+    )
 
 
 def own_map(scene: Any) -> np.ndarray:

@@ -308,10 +308,11 @@ class LightTransport:
         """Return T between blocks of pixels and cells of texels; summed up once and kept on disk."""
         if self._overview is None:
             cache, key = self._stored
-            sizes = self.shape, self.grid.shape, self.scene.rows
-            stored = cache.load(key, lambda arrays: overviews.whole(arrays, *sizes))
+            grid = self.grid.shape
+            views = self.scene.rows
+            stored = cache.load(key, lambda arrays: overviews.whole(arrays, self.shape, grid, views))
             if stored is None:
-                stored = vars(overviews.make(self.forward, *sizes))
+                stored = vars(overviews.make(self.forward, self.shape, grid, views))
                 cache.store(key, stored)
             self._overview = overviews.Overview(**{k: np.array(v) for k, v in stored.items()})
         return self._overview

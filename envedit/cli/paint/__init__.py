@@ -8,12 +8,9 @@ import threading
 import webbrowser
 from typing import Any
 
-from envedit.cli.streams import steady
-
 PORT = 8765
 
 
-@steady
 def main(argv: list[str] | None = None) -> int:
     """Serve the page until Ctrl-C; returns the exit code."""
     from envedit.core.errors import EnveditError

@@ -155,9 +155,7 @@ class Worker(threading.Thread):
             with contextlib.ExitStack() as stack:
                 if not again:
                     stack.enter_context(opened.alone())
-                doctor.ensure(opened.settings.variant)
-                mi.set_variant(opened.settings.variant)
-                mi.set_log_level(mi.LogLevel.Error)
+                doctor.select(opened.settings.variant)
                 session = Session(opened, self.tell, lambda: self.newer)
                 if not again:
                     self._held.close()

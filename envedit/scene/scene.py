@@ -40,7 +40,7 @@ from envedit.core.errors import ConfigError, EnveditError, InputError, Numerical
 from envedit.core.quiet_libraries import quiet_libraries
 from envedit.core.radiance import require_unmasked
 from envedit.core.types import ArrayLike, FilePath
-from envedit.scene import film, parser, scene_files, scene_text, supported
+from envedit.scene import film, parser, scene_files, scene_text, supported, vertex_normals
 from envedit.scene.scene_files import SceneFile
 from envedit.scene.usd import conversion as usd
 
@@ -371,6 +371,7 @@ def load(
     if scene.environment() is None or scene.environment().id() != name:
         raise InputError(f"{where}: a ready-made environment emitter cannot be replaced; give its dict")
     params = mi.traverse(scene)
+    vertex_normals.summed_in_order(params)
     key = next(k for k, _ in params if k.split(".")[-2:] == [name, "data"])
     columns, views = views_of(scene, names)
 

@@ -16,16 +16,15 @@ from typing import Any
 import numpy as np
 
 from envedit import config, renderers, representations
-from envedit.core import latlong
+from envedit.core import latlong, resampling
+from envedit.core.array_cache import cache_folder
 from envedit.core.errors import NumericalError
-from envedit.core.resampling import fit as fitted
 from envedit.core.rows import Rows
 from envedit.core.seeds import Seeds
 from envedit.core.types import Params
 from envedit.images import map_regions
 from envedit.losses.perceptual import distances
 from envedit.representations.layers import below_horizon
-from envedit.representations.siren import fit
 from envedit.scene.renderings import rendered
 from envedit.scene.scene import Scene
 from envedit.solve import adam_loop, adam_solver, initialization, turning
@@ -289,7 +288,7 @@ class Preparation:
         return representations.encoded(
             crop,
             self.settings,
-            fit.default_folder(),
+            cache_folder("fits"),
             lambda done, total, loss: self.watch.progress(done, total, f"loss {loss:.4g}"),
             self.rows.place,
             horizon,
@@ -344,5 +343,5 @@ def _misfits(rendering, picture, weight):
     if weight is not None:
         off = off * weight / weight.mean(dtype=np.float64)
     height, width, _ = off.shape
-    parts = off, fitted(off, min(AREAS, height), min(AREAS, width))
+    parts = off, resampling.fit(off, min(AREAS, height), min(AREAS, width))
     return [float(np.sqrt(np.square(part).mean(axis=2)).mean()) for part in parts]

@@ -11,6 +11,7 @@ from envedit.cli import doctor
 from envedit.cli.console import Console, exit_code, make_parser
 from envedit.cli.streams import steady
 from envedit.config import presets
+from envedit.core.array_cache import cache_folder
 from envedit.images import images
 from envedit.losses import metrics
 from envedit.report import manifest, output_folder, preview
@@ -80,7 +81,7 @@ def _fit(arguments, settings, original, folder, console):
             settings.fit,
             settings.seed,
             rows.place,
-            folder=fit.default_folder(),
+            folder=cache_folder("fits"),
             progress=lambda done, total, loss: progress.update(done, total, f"loss {loss:.4g}"),
         )
 

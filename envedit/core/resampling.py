@@ -32,3 +32,22 @@ def _resampling(old, new):
     texel = np.arange(old)
     overlap = np.minimum(edges[1:, None], texel + 1) - np.maximum(edges[:-1, None], texel)
     return (np.clip(overlap, 0, None) * (new / old)).astype(np.float32)
+
+
+def bilinear(image: np.ndarray, row: np.ndarray, column: np.ndarray, around: bool = False) -> np.ndarray:
+    """Interpolate an image (H, W, C) at places in pixels from the centre of the first one.
+
+    ``row`` and ``column`` broadcast against each other to (...); returns (..., C). Beyond its border the
+    image goes on as there; ``around``: at the other side, left and right.
+    """
+    height, width, _ = image.shape
+    row = np.clip(row, 0, height - 1)
+    column = column if around else np.clip(column, 0, width - 1)
+    top, left = np.floor(row).astype(np.int64), np.floor(column).astype(np.int64)
+    down, right = (row - top)[..., None], (column - left)[..., None]
+    bottom = np.minimum(top + 1, height - 1)
+    beside = (left + 1) % width if around else np.minimum(left + 1, width - 1)
+    left = left % width
+    upper = (1 - right) * image[top, left] + right * image[top, beside]
+    lower = (1 - right) * image[bottom, left] + right * image[bottom, beside]
+    return (1 - down) * upper + down * lower

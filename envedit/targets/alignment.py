@@ -14,6 +14,8 @@ from dataclasses import astuple, dataclass, replace
 
 import numpy as np
 
+from envedit.core import resampling
+
 MOST_SHIFT, MOST_SCALE, MOST_ROTATION = 0.06, 0.06, 3.0
 """Largest shift, as a share of the width, scale beside 1, and rotation in degrees that are looked for."""
 GRID = 5
@@ -72,13 +74,7 @@ class Placement:
         across = (cosine * x - sine * y + self.right * width) * columns / width + columns / 2 - 0.5
         down = (sine * x + cosine * y + self.down * width) * rows / height + rows / 2 - 0.5
         inside = (across > -0.51) & (across < columns - 0.49) & (down > -0.51) & (down < rows - 0.49)
-        left = np.clip(np.floor(across), 0, columns - 2).astype(int)
-        top = np.clip(np.floor(down), 0, rows - 2).astype(int)
-        right_part = np.clip(across - left, 0, 1)[..., None]
-        lower_part = np.clip(down - top, 0, 1)[..., None]
-        upper = (1 - right_part) * picture[top, left] + right_part * picture[top, left + 1]
-        lower = (1 - right_part) * picture[top + 1, left] + right_part * picture[top + 1, left + 1]
-        return (1 - lower_part) * upper + lower_part * lower, inside
+        return resampling.bilinear(picture, down, across), inside
 
 
 def find(photo: np.ndarray, rendering: np.ndarray) -> tuple[Placement, bool]:

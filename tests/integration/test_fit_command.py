@@ -7,6 +7,7 @@ import pytest
 
 from envedit import config
 from envedit.cli import fit as fit_command
+from envedit.core.array_cache import cache_folder
 from envedit.images import images
 from envedit.losses import metrics
 from envedit.representations.siren import fit
@@ -33,7 +34,7 @@ def test_the_fit_of_the_rows_is_written_and_measured(coordinates, rows, first, l
     assert "log-PSNR" in capsys.readouterr().out
     crop = picture[first : last + 1]
     network = config.Representation(hidden=10, depth=1, coordinates=coordinates)
-    expected = fit.fit(crop, network, config.Fit(epochs=4), 0, (first, 8), folder=fit.default_folder())
+    expected = fit.fit(crop, network, config.Fit(epochs=4), 0, (first, 8), folder=cache_folder("fits"))
     assert expected.cached  # the command made this very fit
     written = images.read(tmp_path / "out" / "fitted.exr")[0]
     assert written.shape == crop.shape

@@ -39,13 +39,7 @@ def sampled(path: str, u: np.ndarray, v: np.ndarray, spacing: float) -> np.ndarr
     pixels = max(levels[0].shape[:2])
     level = levels[min(max(math.ceil(math.log2(max(spacing * pixels, 1))), 0), len(levels) - 1)]
     height, width, _ = level.shape
-    x, y = np.clip(u * width - 0.5, 0, width - 1), np.clip(v * height - 0.5, 0, height - 1)
-    left, top = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
-    right, down = np.minimum(left + 1, width - 1), np.minimum(top + 1, height - 1)
-    x, y = (x - left)[..., None], (y - top)[..., None]
-    above = (1 - x) * level[top, left] + x * level[top, right]
-    below = (1 - x) * level[down, left] + x * level[down, right]
-    return ((1 - y) * above + y * below).astype(np.float32)
+    return resampling.bilinear(level, v * height - 0.5, u * width - 0.5).astype(np.float32)
 
 
 def _levels(path):

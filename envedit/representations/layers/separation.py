@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from envedit.core import latlong
+from envedit.core import latlong, resampling
 from envedit.core.color import LUMINANCE
 
 CONTRAST = 4.0
@@ -237,14 +237,7 @@ class _Places:
         if values.shape[:2] == (height, width):
             return values
         r, c = self._places(height, width)
-        r = np.clip(r, 0, values.shape[0] - 1)
-        top, left = np.floor(r).astype(np.int64), np.floor(c).astype(np.int64)
-        down, right = (r - top)[:, None, None], (c - left)[None, :, None]
-        bottom = np.minimum(top + 1, values.shape[0] - 1)
-        a, b = left % values.shape[1], (left + 1) % values.shape[1]
-        upper = values[top][:, a] * (1 - right) + values[top][:, b] * right
-        lower = values[bottom][:, a] * (1 - right) + values[bottom][:, b] * right
-        return upper * (1 - down) + lower * down
+        return resampling.bilinear(values, r[:, None], c, around=True)
 
     def _places(self, height, width):
         """Fractional rows and columns of the small copy at the centres of the image's texels."""

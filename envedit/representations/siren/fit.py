@@ -21,7 +21,7 @@ import mitsuba as mi
 import numpy as np
 
 from envedit import config
-from envedit.core.array_cache import DiskCache, cache_folder, holds
+from envedit.core.array_cache import DiskCache, holds
 from envedit.core.arrays import tensor
 from envedit.core.errors import InputError, NumericalError, place_of
 from envedit.losses import losses, metrics, optimizer, ssim
@@ -335,11 +335,6 @@ def _grids(image, normalisation, x, settings):
 
 
 # ---- fits on disk ------------------------------------------------------------------------------------------
-
-
-def default_folder() -> Path:
-    """Folder in which fits are kept: $XDG_CACHE_HOME/envedit/fits, or ~/.cache/envedit/fits."""
-    return cache_folder("fits")
 
 
 def _key(image, network, settings, seed, rows):

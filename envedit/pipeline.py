@@ -27,6 +27,7 @@ from envedit.losses.perceptual import installed
 from envedit.maps import map_lights
 from envedit.preparation import Preparation
 from envedit.report import variants
+from envedit.representations.layers.layers import Layers
 from envedit.results import Result
 from envedit.scene.renderings import rendered
 from envedit.solve import adam_loop, adam_solver, feasibility, task
@@ -376,8 +377,10 @@ class _Edit:
             elif target.initial is not None:
                 self.ceiling = self.unedited, target.initial
             by_hand = self.settings.input.orientation
+            layers = self.job.representation if self.job else None
+            moves = layers.light_moves(self.params) if isinstance(layers, Layers) else []
             self.lights, self.core = light_list.of_edit(
-                self.map, self.edited, self.scene.to_world, by_hand, self.degrees
+                self.map, self.edited, self.scene.to_world, by_hand, self.degrees, moves
             )
 
     def _rendered(self, envmap):

@@ -2,12 +2,13 @@
 
 The lights are those that :mod:`.separation` separates from the background, of any map, however it was edited.
 Radiance is what reaches the scene, ``scale`` included. Lights of a map before and after an edit are matched
-by where they are and how much flux they have, whatever moved them.
+by where they are and how much flux they have, beginning with where an edit is known to have put them.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -20,6 +21,8 @@ from envedit.representations.layers.separation import Light, Separation, separat
 
 FARTHEST = math.pi + 1
 """Cost up to which two lights may be one: any angle at equal flux, or half a turn and a factor e of flux."""
+SAME_DEGREES = 2.0
+"""Angle up to which a light that an edit has moved is one of the list: both are separated from one map."""
 MOST_NAMED = 8
 """Lights that :func:`summary` names."""
 _POINTS = 100_000  # of a light, by which its radii are measured
@@ -45,13 +48,19 @@ def split(envmap: np.ndarray, core: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 
 def of_edit(
-    input_map: InputMap, edited: np.ndarray, to_world: np.ndarray, by_hand: Orientation, degrees: float = 0.0
+    input_map: InputMap,
+    edited: np.ndarray,
+    to_world: np.ndarray,
+    by_hand: Orientation,
+    degrees: float = 0.0,
+    moves: Sequence[tuple[np.ndarray, np.ndarray, float]] = (),
 ) -> tuple[dict[str, list[dict]], np.ndarray]:
     """Match the lights of a map as its file has it and as edited.
 
     ``edited`` (H, W, 3) is linear radiance that reaches the scene, ``to_world`` as of :func:`listed`;
-    ``by_hand`` is how the map was rotated when it was read, ``degrees`` by how much the edit turned it.
-    Returns what :func:`matched` does, and the lights of the edited map alone, (H, W, 3) float32.
+    ``by_hand`` is how the map was rotated when it was read, ``degrees`` by how much the edit turned it, and
+    ``moves`` are as of :func:`matched`. Returns what :func:`matched` does, and the lights of the edited map
+    alone, (H, W, 3) float32.
     """
     first = last = separate(input_map.radiance if input_map.unmoved is None else input_map.unmoved)
     if input_map.unmoved is not None:
@@ -61,7 +70,7 @@ def of_edit(
     last = kept(last, separate(edited), input_map.radiance, edited, degrees)
     before, after = (listed(separation.lights, edited.shape[:2], to_world) for separation in (first, last))
     rotation = Orientation(degrees).matrix @ by_hand.matrix
-    return matched(before, after, rotation), np.minimum(last.core, edited).astype(np.float32)
+    return matched(before, after, rotation, moves), np.minimum(last.core, edited).astype(np.float32)
 
 
 def listed(separated: list[Light], shape: tuple[int, int], to_world: np.ndarray) -> list[dict]:
@@ -162,14 +171,18 @@ def kept(
 
 
 def matched(
-    before: list[dict], after: list[dict], rotation: np.ndarray | None = None
+    before: list[dict],
+    after: list[dict],
+    rotation: np.ndarray | None = None,
+    moves: Sequence[tuple[np.ndarray, np.ndarray, float]] = (),
 ) -> dict[str, list[dict]]:
     """Find which light of a map has become which light of the edited map.
 
     Of all ways to pair them, the one with the least sum of angle + abs(ln(flux ratio)) (radians; fluxes are
     means over channels), where a light of ``before`` that is left without another costs :data:`FARTHEST`. Not
     of squares, so that few lights have changed much rather than many a little. Angles are to where
-    ``rotation`` (3, 3), of the whole map between them, brings a light.
+    ``rotation`` (3, 3), of the whole map between them, brings a light; of one that is known to have gone from
+    there, ``moves`` has both directions and the factor of its flux (:meth:`.Layers.light_moves`).
 
     Returns the lists ``before`` and ``after``, of :func:`listed`, with the same ``id`` for a light in both,
     from 1. ``before`` has ``removed``, whether it is gone, and ``after`` has ``added``, whether it is new,
@@ -181,7 +194,13 @@ def matched(
         for lights in (before, after)
     )
     flux = [np.log([max(np.mean(light["flux"]), 1e-30) for light in lights]) for lights in (before, after)]
-    there = start if rotation is None else start @ rotation.T
+    rotated = start if rotation is None else start @ rotation.T
+    there = rotated.copy()
+    for place, now, factor in moves:
+        near = rotated @ place
+        if near.size and near.max() > math.cos(math.radians(SAME_DEGREES)):
+            there[near.argmax()] = now
+            flux[0][near.argmax()] += math.log(max(factor, 1e-30))
     apart = np.arccos(np.clip(there @ end.T, -1, 1))
     partner = _paired(apart + np.abs(flux[0][:, None] - flux[1]))
     moved = np.degrees(np.arccos(np.clip(start @ end.T, -1, 1)))

@@ -170,6 +170,11 @@ def of_place(problem: Problem) -> float:
     return 2 * np.log(max(len(directions), 1)) * problem.likelihood.robust
 
 
+def of_choice(problem: Problem) -> float:
+    """Return what it costs that a light of the map shines elsewhere: it could be any of them."""
+    return 2 * np.log(max(problem.layers.lights.own, 1))
+
+
 def of_light(problem: Problem) -> float:
     """Return what an added light costs."""
     return ADDED_LIGHT_COST + of_place(problem)
@@ -185,7 +190,7 @@ def score(problem: Problem, run: gauss_newton.Run, point: Point, sigma: float) -
     _, prior = np.linalg.slogdet(normal.precision)
     # ---- What lights cost
     cost = of_light(problem) * len(problem.added(run.state))
-    cost += of_place(problem) * len(_replaced(problem, run))
+    cost += (of_choice(problem) + of_place(problem)) * len(_replaced(problem, run))
     if problem.likelihood.robust:
         cost += FADED_LIGHT_COST * len(_faded(problem, run.state))
     evidence = float(problem.unlikeliness(point, run.start, sigma) + posterior - prior + cost)
@@ -298,11 +303,12 @@ def _changes(problem, state, start, sigma):
         dark = with_light(state, k, flux=DARK)
         # ---- elsewhere
         away = problem.direction(state, k)
+        cost = of_choice(problem) if own and not start["turn"][k].any() else 0.0
         for there in painted_places.best(problem, dark, k, sigma, away):
             placed = _placed(lights, k, there)
             centre = {"turn": placed["turn"]} if own else placed
             moved = with_light(state, k, **placed)
-            yield k, MOVED, moved, with_light(start, k, **centre), there.unlikeliness, 0.0
+            yield k, MOVED, moved, with_light(start, k, **centre), there.unlikeliness, cost
         # ---- softer: a light of few texels cannot grow, as its texels would part; a lobe can
         if own and spare:
             flux = state["flux"][k] + np.log(lights.flux[k] / np.maximum(lights.flux[spare[0]], 1e-30))

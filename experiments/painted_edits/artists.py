@@ -39,10 +39,14 @@ EDIT = "edit"
 
 def options(parser):
     parser.add_argument("--count", type=int, help="so many cases, evenly from all edits")
+    rooms = "under the maps of ENVEDIT_DATA/hdri, most of which have several lights, in place of skies"
+    parser.add_argument("--rooms", action="store_true", help=rooms)
 
 
 def cases(args):
-    data, maps = puresky.data(), puresky.find()
+    data = puresky.data()
+    skies = puresky.find() if not args.rooms else {}
+    maps = puresky.others() if args.rooms else {name: skies[name] for name in MAPS if name in skies}
     files = {
         "matpreview": {
             "file": str(data / "scenes" / "matpreview" / "matpreview.xml"),
@@ -52,7 +56,7 @@ def cases(args):
     }
     turns = {"matpreview": {"rotate_degrees": MATPREVIEW_TURN}}
     made = []
-    for edit, scene, name in itertools.product(PAINTERS, SCENES, filter(maps.__contains__, MAPS)):
+    for edit, scene, name in itertools.product(PAINTERS, SCENES, maps):
         if name in SHADOWLESS and edit in SHADOWS:
             continue
         tables = {
@@ -62,16 +66,16 @@ def cases(args):
         about = {"edit": edit, "scene": scene, "map": name}
         made.append(calling(f"{edit}-{scene}-{name}".replace(" ", "_"), carry_out, tables, about, edit=edit))
     made = [case for case in made if not args.only or any(text in case.name for text in args.only)]
-    return made if args.count is None else evenly(made, args.count)
+    return made if args.count is None else evenly(made, args.count, list(maps))
 
 
-def evenly(made: list[Case], count: int) -> list[Case]:
+def evenly(made: list[Case], count: int, maps: list[str]) -> list[Case]:
     """Pick cases of all edits in the same number; scene and map change from one edit to the next."""
 
     def late(case):
         edit, scene, name = (case.about[key] for key in ("edit", "scene", "map"))
         i = list(PAINTERS).index(edit)
-        return (MAPS.index(name) - i) % len(MAPS), (SCENES.index(scene) - i) % len(SCENES)
+        return (maps.index(name) - i) % len(maps), (SCENES.index(scene) - i) % len(SCENES)
 
     of_edits = [sorted((c for c in made if c.about["edit"] == edit), key=late) for edit in PAINTERS]
     rounds = itertools.zip_longest(*of_edits)

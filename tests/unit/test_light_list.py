@@ -10,6 +10,7 @@ from envedit.core import latlong
 from envedit.core.rotations import Orientation
 from envedit.export import light_list
 from envedit.representations.layers.separation import separate
+from tests.oracles.maps import toward
 
 HEIGHT, WIDTH = 32, 64
 
@@ -47,6 +48,23 @@ def test_a_light_that_is_turned_with_its_map_is_the_same_light():
     expected = math.degrees(2 * math.asin(math.sin(math.radians(20)) * math.cos(math.radians(20))))
     assert (first[0], second[0]) == (2, 1)
     assert first[2] == pytest.approx(expected) and second[2] == pytest.approx(expected)
+
+
+def test_a_light_that_an_edit_has_put_elsewhere_is_the_same_light():
+    """The brighter of two ends far away and ten times as bright: without more, the other one seems to."""
+    before = [light(30, 84, 3.7), light(250, 77, 2.5)]
+    after = [light(150, 0, 34.0), light(35, 84, 2.4)]
+    assert [row[0] for row in numbers(light_list.matched(before, after))] == [1, 2]
+    moves = [(toward(84, 30), toward(84, 30), 0.7), (toward(77, 250), toward(0, 150), 13.0)]
+    found = light_list.matched(before, after, moves=moves)
+    assert [row[0] for row in numbers(found)] == [2, 1]
+    assert numbers(found)[0][2] > 70
+
+    # ---- The whole map turned by 110 degrees as well
+    moves = [(toward(84, 140), toward(84, 140), 0.7), (toward(77, 360), toward(0, 150), 13.0)]
+    after = [light(140, 84, 2.4), light(150, 0, 34.0)]
+    found = light_list.matched(before, after, Orientation(-110).matrix, moves)
+    assert [row[0] for row in numbers(found)] == [1, 2]
 
 
 def test_a_turn_goes_the_way_of_the_map():

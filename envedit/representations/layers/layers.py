@@ -23,6 +23,7 @@ from envedit.core import latlong
 from envedit.core.arrays import tensor
 from envedit.core.color import LUMINANCE
 from envedit.core.radiance import BRIGHTEST, require_radiance
+from envedit.core.rotations import rotated
 from envedit.representations.layers import behind_glow
 from envedit.representations.layers.behind_glow import BehindGlow
 from envedit.representations.layers.below_horizon import Below, Horizon, sky_rows
@@ -207,6 +208,15 @@ class Layers:
     def _real(self, params):
         """Return parameters as logarithms and radians."""
         return {name: value * self.scales[name] for name, value in params.items()}
+
+    def light_moves(self, params: dict) -> list[tuple[np.ndarray, np.ndarray, float]]:
+        """List where each light of the map was and is, unit vectors (3,), and the factor of its mean flux."""
+        real = self._real({name: params[name] for name in ("turn", "flux")})
+        turn, log_flux = (real[name].numpy().astype(np.float64) for name in ("turn", "flux"))
+        return [
+            (centre, rotated(centre, turn[k]), float(np.exp(log_flux[k].mean())))
+            for k, centre in enumerate(self.lights.centres[: self.lights.own])
+        ]
 
     # ---- composing -----------------------------------------------------------------------------------------
 

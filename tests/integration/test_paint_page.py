@@ -20,7 +20,7 @@ from envedit.targets.strokes import gains
 from tests.oracles.builders import LIGHT, write_scene
 from tests.oracles.painting import OF_TWO, SMALL, TWO_VIEWS, photographed, served, until
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("own_core")]
 sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 pytest.importorskip("starlette", reason="the extra envedit[paint] is not installed")
 pytest.importorskip("uvicorn", reason="the extra envedit[paint] is not installed")

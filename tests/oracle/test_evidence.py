@@ -97,3 +97,25 @@ def test_what_is_not_finite_is_no_explanation(rng):
     point = problem.evaluate(beyond)
     assert point.residual is None
     assert search.score(problem, Run(beyond, start), point, SIGMA) == np.inf
+
+
+@pytest.mark.parametrize("lamps", [1, 3])
+def test_a_light_elsewhere_costs_as_many_as_it_could_be(lamps, rng):
+    transport = DenseTransport.random(rng, FILM, GRID, even=0.8)
+    image = np.full((*GRID, 3), LEVEL, np.float32)
+    image[8, [10, 25, 40][:lamps]] = 100
+    picture = transport.apply(mi.TensorXf(image)).numpy()
+    coverage = np.ones((*FILM, 1), np.float32)
+    likelihood = Likelihood.of_paint(coverage, coverage, picture, 0.9 * picture)
+    layers = Layers.of(image, cycles=3)
+    problem = Problem(layers, transport, image, 0.9 * picture, likelihood, of_paint(0.1))
+    start = problem.state(layers.start())
+    for moved in range(lamps + 1):
+        there = start | {"turn": start["turn"].copy()}
+        there["turn"][:moved, 1] = 0.5
+        point = problem.evaluate(there)
+        normal = problem.curvature(point, there, SIGMA)
+        of_posterior, of_prior = (np.linalg.slogdet(one)[1] for one in (normal.hessian, normal.precision))
+        rest = problem.unlikeliness(point, there, SIGMA) + of_posterior - of_prior
+        cost = search.score(problem, Run(there, there), point, SIGMA) - rest
+        assert cost == pytest.approx(moved * 2 * np.log(lamps), abs=1e-6)

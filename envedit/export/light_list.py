@@ -226,7 +226,7 @@ def summary(lights: dict[str, list[dict]], height: int) -> str | None:
     parts = []
     for light in lights["before"]:
         if light["removed"]:
-            parts.append(f"{_named(light)} is gone")
+            parts.append(f"{_named(light)} no longer stands out")
             continue
         end = after.pop(light["id"])
         stayed = end["moved_degrees"] < 180 / height

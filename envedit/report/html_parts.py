@@ -189,7 +189,7 @@ def lights_figure(envmap: np.ndarray, lights: Mapping[str, list[dict]], tonemap:
     over = f'<svg class="lights" viewBox="0 0 360 180" preserveAspectRatio="none">{"".join(drawn)}</svg>'
     caption = (
         "lights of the edited map, numbered as in lights.json; a small circle is where a light was "
-        "(dashed: it is gone), a large one where it is (orange: it is new)"
+        "(dashed: it no longer stands out), a large one where it is (orange: it is new)"
     )
     pixels = preview.display(envmap, tonemap, preview.stops_of([envmap]))
     return [figure(pixels, caption, over=over)]

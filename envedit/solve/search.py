@@ -108,7 +108,7 @@ def search(
         moves = _moves(problem, best, sigma)
         promising = [move for move in moves if move.gain > 0]
         if not promising and len(compared) == 1 and _unfollowed(problem, best, sigma):
-            promising = moves  # for other explanations to be shown
+            promising = _of_best_kinds(moves)  # for other explanations to be shown
         neighbours = _neighbours(problem, best, promising, sigma, after_step, steps, cleared)
         compared += neighbours
         better = _likelier(best, neighbours)
@@ -232,6 +232,16 @@ def _moves(problem, best, sigma):
         for move in moves
         if move.gain >= max(one.gain for one in moves) - POSITIVE_EVIDENCE
     ]
+
+
+def _of_best_kinds(moves):
+    """List the moves of as many kinds as are shown, those that promise most."""
+    promise: dict[tuple[int, str], float] = {}
+    for move in moves:
+        kind = move.light, move.what
+        promise[kind] = max(move.gain, promise.get(kind, -np.inf))
+    kinds = sorted(promise, key=lambda kind: -promise[kind])[:MOST_OTHERS]
+    return [move for move in moves if (move.light, move.what) in kinds]
 
 
 def _beside_the_sky(problem, best, sigma):

@@ -94,7 +94,7 @@ def test_a_light_that_the_edit_left_alone_is_the_same_light(changed):
     lists = [light_list.listed(one.lights, one.core.shape[:2], np.eye(3)) for one in (before, found)]
     said = light_list.summary(light_list.matched(*lists, Orientation(degrees).matrix), HEIGHT)
     azimuth = round(50.5 / WIDTH * 360 - degrees)
-    assert "is gone" in said if changed else f"to azimuth {azimuth}, elevation" in said
+    assert "no longer stands out" in said if changed else f"to azimuth {azimuth}, elevation" in said
     np.testing.assert_array_equal(found.core, 0 if changed else latlong.rotate(before.core, degrees))
 
 
@@ -137,7 +137,8 @@ def test_lights_that_come_go_and_stay_are_told():
     assert numbers(found)[2][2] is None
     assert light_list.summary(found, HEIGHT) == (
         "light 1 at azimuth 90, elevation 35 stayed; light 2 at azimuth 200, elevation 60 stayed, flux x 2; "
-        "light 3 at azimuth 300, elevation 10 is gone; light 4 at azimuth 20, elevation 80 is new"
+        "light 3 at azimuth 300, elevation 10 no longer stands out; "
+        "light 4 at azimuth 20, elevation 80 is new"
     )
     moved = light_list.matched([light(90, 0)], [light(120, 0)])
     assert "moved by 30.0 degrees to azimuth 120, elevation 0" in light_list.summary(moved, HEIGHT)

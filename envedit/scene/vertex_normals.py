@@ -11,6 +11,8 @@ import numpy as np
 ROUNDING = 1e-5
 """Largest difference of components from which on a normal is the file's own. Of three meshes, of 3 to 56
 thousand vertices, what Mitsuba computes is within 3e-7 of the exact sum."""
+FACES = 1 << 20
+"""Faces that are summed at once: bounds the memory."""
 
 
 def summed_in_order(params: mi.SceneParameters) -> None:
@@ -33,15 +35,17 @@ def normals(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
     Thürmer and Wüthrich (1998), as Mitsuba; (n, 3), 0 where no face has a direction.
     """
-    corners = positions[faces].astype(np.float64)
-    edges = np.roll(corners, -1, axis=1) - corners
-    of_face = _unit(np.cross(edges[:, 0], edges[:, 1]))
     total = np.zeros((len(positions), 3))
-    for corner in range(3):
-        ahead, back = _unit(edges[:, corner]), _unit(-edges[:, corner - 1])
-        angle = np.arccos(np.clip((ahead * back).sum(axis=1), -1, 1))
-        for axis in range(3):
-            total[:, axis] += np.bincount(faces[:, corner], angle * of_face[:, axis], len(positions))
+    for start in range(0, len(faces), FACES):
+        some = faces[start : start + FACES]
+        corners = positions[some].astype(np.float64)
+        edges = np.roll(corners, -1, axis=1) - corners
+        of_face = _unit(np.cross(edges[:, 0], edges[:, 1]))
+        for corner in range(3):
+            ahead, back = _unit(edges[:, corner]), _unit(-edges[:, corner - 1])
+            angle = np.arccos(np.clip((ahead * back).sum(axis=1), -1, 1))
+            for axis in range(3):
+                total[:, axis] += np.bincount(some[:, corner], angle * of_face[:, axis], len(positions))
     return _unit(total)
 
 

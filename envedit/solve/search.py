@@ -236,11 +236,8 @@ def _moves(problem, best, sigma):
 
 def _of_best_kinds(moves):
     """List the moves of as many kinds as are shown, those that promise most."""
-    promise: dict[tuple[int, str], float] = {}
-    for move in moves:
-        kind = move.light, move.what
-        promise[kind] = max(move.gain, promise.get(kind, -np.inf))
-    kinds = sorted(promise, key=lambda kind: -promise[kind])[:MOST_OTHERS]
+    ranked = sorted(moves, key=lambda move: -move.gain)
+    kinds = list(dict.fromkeys((move.light, move.what) for move in ranked))[:MOST_OTHERS]
     return [move for move in moves if (move.light, move.what) in kinds]
 
 

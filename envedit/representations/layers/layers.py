@@ -30,7 +30,7 @@ from envedit.representations.layers.below_horizon import Below, Horizon, sky_row
 from envedit.representations.layers.composition import Fields, Glows, compose
 from envedit.representations.layers.gain import CYCLES, GridGain, Octave
 from envedit.representations.layers.ground_light import GroundLight
-from envedit.representations.layers.lights import DARK, SPARE, Lights
+from envedit.representations.layers.lights import DARK, SPARE, Lights, flux_factor
 from envedit.representations.layers.saturation import saturated
 from envedit.representations.layers.separation import MOVABLE, Separation, separate
 
@@ -210,11 +210,11 @@ class Layers:
         return {name: value * self.scales[name] for name, value in params.items()}
 
     def light_moves(self, params: dict) -> list[tuple[np.ndarray, np.ndarray, float]]:
-        """List where each light of the map was and is, unit vectors (3,), and the factor of its mean flux."""
+        """List where each light of the map was and is, unit vectors (3,), and the mean factor of its flux."""
         real = self._real({name: params[name] for name in ("turn", "flux")})
         turn, log_flux = (real[name].numpy().astype(np.float64) for name in ("turn", "flux"))
         return [
-            (centre, rotated(centre, turn[k]), float(np.exp(log_flux[k].mean())))
+            (centre, rotated(centre, turn[k]), float(flux_factor(log_flux[k]).mean()))
             for k, centre in enumerate(self.lights.centres[: self.lights.own])
         ]
 

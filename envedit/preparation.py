@@ -6,6 +6,7 @@ or a network is fitted, and it is found out where the edit starts.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
@@ -30,17 +31,13 @@ from envedit.scene.scene import Scene
 from envedit.solve import adam_loop, adam_solver, initialization, turning
 from envedit.solve.edit_state import EditState, Watch
 from envedit.solve.layers_solver import LayersSolver
+from envedit.solve.likelihood import INDEPENDENT
 from envedit.solve.search import STRONG_EVIDENCE
 from envedit.targets.target import Target
 
-TURNED = 0.5
-"""A turn that leaves more than noise is considered if it leaves at most this share of the residual."""
 TO_NOISE = 1.25
 """Residual of a map's rendering over that of a second one of the same map up to which the map explains the
-target. Between renderings of one map the ratio is 1, with a standard error of 0.06 in :data:`AREAS` areas."""
-AREAS = 16
-"""Areas on each axis of a picture over which residuals are averaged, beside single pixels: noise is smaller
-there, and a small change of the light is not. 256 residuals, as in :data:`.map_problem.INDEPENDENT`."""
+target. Between renderings of one map the ratio is 1, with a standard error of 0.06 in 256 areas."""
 TURN_PATHS = 2**20
 """Paths of a rendering that is compared to find a turn, all pixels together, up to a factor of two; at most
 as many as the target's."""
@@ -137,7 +134,7 @@ class Preparation:
 
         # ---- Edits of the turned and of the unturned map
         always = self.settings.representation.turn is True
-        if not always and turn.left >= TURNED:
+        if not always and turn.left >= turning.EXPLAINED:
             return self._prepared(target, 0.0, [])
         turned = self._prepared(target, turn.degrees, [note])
         if always or turned.job.layers.begun is None:
@@ -338,10 +335,14 @@ class Preparation:
 
 
 def _misfits(rendering, picture, weight):
-    """Return the display residual, mean of its size over pixels and over areas."""
+    """Return the display residual, mean of its size over pixels and over areas.
+
+    Of areas, as many as residuals are independent, noise is smaller, and a small change of the light is not.
+    """
     off = turning.residuals(rendering, picture)
     if weight is not None:
         off = off * weight / weight.mean(dtype=np.float64)
     height, width, _ = off.shape
-    parts = off, resampling.fit(off, min(AREAS, height), min(AREAS, width))
+    across = math.isqrt(INDEPENDENT)
+    parts = off, resampling.fit(off, min(across, height), min(across, width))
     return [float(np.sqrt(np.square(part).mean(axis=2)).mean()) for part in parts]

@@ -104,14 +104,6 @@ def isolated(tmp_path_factory):
         yield
 
 
-@pytest.fixture
-def every_step(monkeypatch):
-    """Let ``after_step`` be called after every step."""
-    from envedit.solve import adam_loop
-
-    monkeypatch.setattr(adam_loop, "READ_EVERY", 1)
-
-
 @pytest.fixture(scope="module")
 def own_core():
     """Have no more threads than this process has cores: more wait for those of other tests in loops.

@@ -21,7 +21,6 @@ from envedit.report import html_tables as tables
 from envedit.report import preview
 from envedit.report.curves import curves_svg, escape, normalised
 from envedit.report.manifest import plain
-from envedit.solve import feasibility
 
 if TYPE_CHECKING:
     from envedit.results import Result
@@ -171,7 +170,7 @@ def _painted(result):
     """Draw what of the paint is not feasible, of each view."""
     if result.reach is None:
         return []
-    codes = np.rint(255 * feasibility.unreachable(result.reach)).astype(np.uint8)
+    codes = np.rint(255 * preview.unreachable(result.reach)).astype(np.uint8)
     views = [view.rows for view in result.views] if len(result.views) > 1 else [slice(None)]
     caption = f"what is not feasible; {100 * result.reach.share:.0f} % of the painted change is feasible"
     words = parts.scale(("marked red: stays darker than painted", "marked blue: brighter"))

@@ -18,6 +18,7 @@ from envedit.core.color import tonemap as apply_tonemap
 from envedit.core.resampling import fit
 from envedit.core.types import FilePath, Views
 from envedit.images.images import png
+from envedit.solve.feasibility import Reach
 from envedit.targets.photo import Photo
 from envedit.transport.influence import per_solid_angle
 
@@ -29,6 +30,8 @@ GAP = 6
 """Pixels between the pictures of a sheet."""
 WIDEST = 1024
 """Pixels along a picture of the report, at most."""
+FULL_COLOUR_DIFFERENCE = 0.25
+"""Difference of display values that :func:`unreachable` shows in full colour."""
 
 
 # ----------------------------------------------------------------------------------------------------------
@@ -231,6 +234,19 @@ def influence_caption(frozen: np.ndarray | None) -> str:
 def share_image(share: np.ndarray) -> np.ndarray:
     """Draw shares from 0 to 1, (H, W), in colours from violet to yellow: (H, W, 3) uint8."""
     return _colours(RISING, np.asarray(share, np.float64))
+
+
+def unreachable(reach: Reach) -> np.ndarray:
+    """Show the infeasible rest as display values (h, w, 3) in [0, 1].
+
+    White: feasible. Red: stays darker than painted. Blue: stays brighter. Full colour is a difference of
+    :data:`FULL_COLOUR_DIFFERENCE` in display values, whatever the request, so that pictures can be compared.
+    Shown is the channel that differs most.
+    """
+    most = np.abs(reach.residual).argmax(axis=2)
+    signed = np.take_along_axis(reach.residual, most[..., None], axis=2)[..., 0] / FULL_COLOUR_DIFFERENCE
+    red, blue = np.clip(signed, 0, 1), np.clip(-signed, 0, 1)
+    return np.stack([1 - blue, 1 - np.maximum(red, blue), 1 - red], axis=2).astype(np.float32)
 
 
 def photograph(photo: Photo, rendering: np.ndarray, outliers: np.ndarray) -> list[np.ndarray]:

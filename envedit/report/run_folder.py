@@ -17,7 +17,7 @@ from envedit.export import file_resolution
 from envedit.images import images, layered_exr
 from envedit.losses.perceptual import installed
 from envedit.report import html_report, manifest, map_files, output_folder, preview, variants
-from envedit.solve import checkpoint, feasibility
+from envedit.solve import checkpoint
 
 if TYPE_CHECKING:
     from envedit import results
@@ -136,7 +136,7 @@ def _write_maps(settings, folder, result):
         pictures = preview.photograph(result.photo, result.render, result.outliers)
         images.write_png(folder / "photograph.png", np.concatenate(pictures, axis=1))
     if result.reach is not None:
-        images.write_png(folder / "unreachable.png", feasibility.unreachable(result.reach))
+        images.write_png(folder / "unreachable.png", preview.unreachable(result.reach))
 
 
 def _write_renderings(settings, folder, result):

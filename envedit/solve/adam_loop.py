@@ -31,8 +31,6 @@ MOST_BAD_STEPS = 20
 """Non-finite steps in a row after which the loop gives up."""
 RECOVERY = 10
 """Good steps after which one halving of the learning rate is undone, as bad samples may be rare."""
-READ_EVERY, READ_SECONDS = 10, 1.0
-"""Losses become rows of the history, and the caller hears of them, after so many steps or seconds."""
 
 
 class Objective:
@@ -255,8 +253,8 @@ def optimise(
     adam, state : optional
         To continue an earlier run; changed in place.
     after_step : callable, optional
-        Called with state and optimiser whenever the losses have been read back, and at the end: progress and
-        checkpoints. What it raises ends the run.
+        Called with state and optimiser after every step: progress and checkpoints. What it raises ends the
+        run.
 
     Returns
     -------
@@ -274,8 +272,6 @@ def optimise(
     lr = _rate(representation, settings)
     fixed = tensor(envmap)
     keep = _Keep(envmap[first_row : first_row + len(free)], free) if free is not None else None
-    waiting: list = []
-    last_read = time.perf_counter()
     while state.step < settings.iterations:
         start = time.perf_counter()
         leaves, slopes = adam.leaves(), _Slopes()
@@ -300,37 +296,21 @@ def optimise(
             state.bad_in_a_row += 1
             state.slowdown *= 0.5
             if state.bad_in_a_row >= MOST_BAD_STEPS:
-                _read_back(waiting, state)
                 raise NumericalError(
                     f"the edit stopped at iteration {state.step}: {MOST_BAD_STEPS} steps in a row were not "
                     "finite; the last good map is kept; lower [optimizer] lr or look at the target for "
                     "extreme pixels"
                 )
-        waiting.append(
-            (
-                state.step,
-                dr.detach(total),
-                {k: dr.detach(v) for k, v in terms.items()},
-                rate,
-                1000 * (time.perf_counter() - start),
-            )
+        values = {"loss": total, **terms}
+        state.history.append(
+            {
+                "iteration": state.step,
+                **{name: float(value[0]) for name, value in values.items()},
+                "lr": rate,
+                "step_ms": round(1000 * (time.perf_counter() - start), 3),
+            }
         )
         state.step += 1
-        now = time.perf_counter()
-        if len(waiting) >= READ_EVERY or now - last_read > READ_SECONDS or state.step == settings.iterations:
-            _read_back(waiting, state)
-            last_read = now
-            if after_step:
-                after_step(state, adam)
+        if after_step:
+            after_step(state, adam)
     return adam.params, state
-
-
-def _read_back(waiting, state):
-    for step, total, terms, lr, ms in waiting:
-        row = {
-            "iteration": step,
-            "loss": float(total[0]),
-            **{name: float(term[0]) for name, term in terms.items()},
-        }
-        state.history.append({**row, "lr": lr, "step_ms": round(ms, 3)})
-    waiting.clear()

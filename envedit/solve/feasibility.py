@@ -32,14 +32,13 @@ from envedit.core.color import tonemap
 from envedit.core.rows import Rows
 from envedit.core.seeds import SIGNS
 from envedit.images import map_regions
+from envedit.solve.gain_bandwidth import PROBES
 from envedit.solve.likelihood import STATEMENTS, Likelihood, on_average_one
 from envedit.transport.block_transport import CELLS, tiles
 from envedit.transport.light_transport import LightTransport
 
 SHARP_SAMPLES = 4.0
 """Samples behind an entry of T from which on the texels of a cell are distinguished."""
-PROBES = 8
-"""Random pictures by which these samples are counted."""
 LINEARISATIONS, STEPS = 2, 40
 """How often the display curve is linearised, and steps of the solution each time."""
 METRIC_FLOOR = 0.1
@@ -48,8 +47,6 @@ LEAST_SLOPE_SPAN = 1e-3
 """Least difference of radiance over which the display curve's slope is taken: finite at black."""
 WARNED_SHARE = 0.5
 """Below this share :attr:`Reach.warning` warns."""
-FULL_COLOUR_DIFFERENCE = 0.25
-"""Difference of display values that :func:`unreachable` shows in full colour."""
 
 
 @dataclass(frozen=True)
@@ -88,19 +85,6 @@ class Reach:
 
 def _percent(share):
     return int(100 * share)  # cut, not rounded: 49.6 % is less than half
-
-
-def unreachable(reach: Reach) -> np.ndarray:
-    """Show the infeasible rest as display values (h, w, 3) in [0, 1].
-
-    White: feasible. Red: stays darker than painted. Blue: stays brighter. Full colour is a difference of
-    :data:`FULL_COLOUR_DIFFERENCE` in display values, whatever the request, so that pictures can be compared.
-    Shown is the channel that differs most.
-    """
-    most = np.abs(reach.residual).argmax(axis=2)
-    signed = np.take_along_axis(reach.residual, most[..., None], axis=2)[..., 0] / FULL_COLOUR_DIFFERENCE
-    red, blue = np.clip(signed, 0, 1), np.clip(-signed, 0, 1)
-    return np.stack([1 - blue, 1 - np.maximum(red, blue), 1 - red], axis=2).astype(np.float32)
 
 
 def reachable(

@@ -13,8 +13,8 @@ from envedit import config
 from envedit.core.color import tonemap
 from envedit.solve.likelihood import VISIBLE
 
-LEAST_RAISE, LARGEST_RAISE, LARGEST_HOLD = 1.5, 16.0, 256.0
-"""Least and largest factor by which the weight is raised at once; largest weight."""
+RAISE, LARGEST_HOLD = 4.0, 256.0
+"""Factor by which the weight is raised at once, and the largest weight."""
 
 
 def change(rendering: np.ndarray, aim: np.ndarray, coverage: np.ndarray, counts: np.ndarray) -> float:
@@ -45,14 +45,11 @@ def further(
 ) -> float | None:
     """Return the weight with which an edit goes on; None where it need not, or where the weight was given.
 
-    Residuals count by their squares: the weight grows with the square of the change, if that is visible.
     ``chosen`` is table ``[target]``, ``weight`` that of what was not painted, in the steps that led to
     ``rendering``; further arguments are those of :func:`change`.
     """
     if chosen.hold != "auto" or chosen.rest == "follow" or not chosen.paint:
         return None
-    changed = change(rendering, aim, *pixels)
-    if changed <= VISIBLE or weight >= LARGEST_HOLD:
+    if change(rendering, aim, *pixels) <= VISIBLE or weight >= LARGEST_HOLD:
         return None
-    factor = float(np.clip((changed / VISIBLE) ** 2, LEAST_RAISE, LARGEST_RAISE))
-    return min(LARGEST_HOLD, weight * factor)
+    return min(LARGEST_HOLD, RAISE * weight)

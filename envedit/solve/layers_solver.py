@@ -25,9 +25,6 @@ from envedit.solve.likelihood import SIGMA
 from envedit.solve.map_problem import Posterior
 from envedit.transport.light_transport import LightTransport
 
-CHECKED_SPP = 64
-"""Samples a pixel of renderings by which start and solution are compared."""
-
 
 @dataclass
 class LayersSolver:
@@ -306,7 +303,7 @@ class LayersSolver:
         """Return the mean square of display values of Mitsuba's rendering of a map less the target's."""
         target = self.edit.target
         seed = Seeds.of(self.edit.settings.seed).step_check
-        shown = display_curve.to_display(tensor(self.edit.scene.render(envmap, CHECKED_SPP, seed)))
+        shown = display_curve.to_display(tensor(self.edit.scene.render(envmap, transport_error.SPP, seed)))
         missed = shown.numpy() - display_curve.to_display(tensor(target.picture)).numpy()
         weight = 1 if target.known_weight is None else target.known_weight
         return float((np.square(missed) * weight).mean())

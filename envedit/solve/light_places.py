@@ -22,8 +22,8 @@ from envedit.representations.layers.lights import FAINTEST
 from envedit.solve.map_problem import Point, Problem
 from envedit.solve.normal_equations import Normal, forward
 
-PROBE_SPACINGS, PROBE_REACH = (2, 1), (2, 1)
-"""Distances in texels of the exact columns around the best cell, and how many of them to each side."""
+PROBE_SPACINGS = (2, 1)
+"""Distances in texels of the exact columns around the best cell, one after the other."""
 PLACES_REFINED = 2
 """Best places of one light that are refined."""
 PLACES_APART_COSINE = np.cos(np.radians(15.0))
@@ -139,7 +139,8 @@ class Places:
         height, width = self.problem.envmap.shape[:2]
         row, column = (round(float(x)) for x in latlong.texel_position(place.direction, height, width))
         picture = None
-        for spacing, reach in zip(PROBE_SPACINGS, PROBE_REACH, strict=True):
+        for spacing in PROBE_SPACINGS:
+            reach = spacing  # texels to each side: as many as they are apart
             if self.problem.transport.capacity < (2 * reach + 1) ** 2:
                 break  # memory leaves no exact columns to refine
             texels, pictures = probed(self.problem, row, column, flux, spacing, reach, self._ground)

@@ -16,7 +16,14 @@ from envedit.core.arrays import flat, tensor
 from envedit.core.rotations import rotation_vector
 from envedit.losses import display_curve
 from envedit.representations.layers.lights import LOBE_DEGREES
-from envedit.solve.light_places import PLACES_APART_COSINE, is_apart, lit_ground, most_promising, probed
+from envedit.solve.light_places import (
+    PLACES_APART_COSINE,
+    PROBE_SPACINGS,
+    is_apart,
+    lit_ground,
+    most_promising,
+    probed,
+)
 from envedit.solve.likelihood import Likelihood, of_mean
 from envedit.solve.map_problem import Problem
 
@@ -29,8 +36,6 @@ LARGER_DEGREES = (2.0, 8.0)
 POSITIVE_EVIDENCE = 2.0
 """Difference of -2 log likelihood up to which two places promise as much as each other: "not worth more than
 a bare mention" (Kass and Raftery 1995)."""
-TRIAL_SPACINGS = (2, 1)
-"""Distances in texels of the places that are tried around the best cell, one after the other."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +111,7 @@ class _Trial:
         """Return the best texel around a direction, through exact columns."""
         height, width = self.problem.envmap.shape[:2]
         row, column = (round(float(x)) for x in latlong.texel_position(direction, height, width))
-        for spacing in TRIAL_SPACINGS:
+        for spacing in PROBE_SPACINGS:
             texels, pictures = probed(
                 self.problem, row, column, self.flux, spacing, reach=1, ground=self.ground
             )

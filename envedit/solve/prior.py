@@ -44,11 +44,9 @@ PHOTOGRAPHED = (
 """Along luminance, blue-amber and green-magenta; nine maps (``python -m experiments natural.skies run``)."""
 LEAST_WHOLE_FREEDOM = 0.25
 """Least freedom of one factor for the whole sky: photographs differ in exposure as their makers chose it."""
-LEAST_FREEDOM = 0.01
-"""Freedom that 0 stands for: a gain that is the same everywhere, to a hundredth of how skies differ."""
 LEAST_VARIANCE = 1e-6
 """Variance of nodes of grids that do not take part: they stay at 0. And the share of the variance at a node
-that is its own, so that nodes at one place differ."""
+that is its own, so that nodes at one place differ; and of a freedom of 0, in units of how skies differ."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +92,7 @@ class Prior:
         first, last = sum(coarse[:-1]), sum(coarse)
         precisions = np.zeros((3, last + ground, last + ground))
         for precision, skies in zip(precisions, PHOTOGRAPHED, strict=True):
-            covariance = skies.covariance(cosine, max(self.freedom, LEAST_FREEDOM), self.factor)
+            covariance = skies.covariance(cosine, max(self.freedom, np.sqrt(LEAST_VARIANCE)), self.factor)
             covariance[np.diag_indices_from(covariance)] *= 1 + LEAST_VARIANCE
             precision[first:last, first:last] = np.linalg.inv(covariance)
             precision[np.arange(first), np.arange(first)] = 1 / LEAST_VARIANCE

@@ -46,8 +46,6 @@ MOST_OTHERS = 3
 FADED_LOG_FLUX, FADED_LIGHT_COST = -1.0, 6 * INDEPENDENT * np.log(1.1)
 """Log flux of a light of the map, over its own, below which it has faded, and what such a light costs under a
 rendered target: as noise that is a tenth larger. Under clouds there is no sun; its disc would be seen."""
-SOFT_DEGREES = 2.0
-"""Radius of the lobe that takes the place of a light where a shadow is to be softer."""
 
 
 @dataclass(frozen=True)
@@ -320,7 +318,7 @@ def _changes(problem, state, start, sigma):
         if own and spare:
             flux = state["flux"][k] + np.log(lights.flux[k] / np.maximum(lights.flux[spare[0]], 1e-30))
             turn = rotation_vector(lights.centres[spare[0]], away)
-            size = lights.log_size(SOFT_DEGREES)
+            size = lights.log_size(painted_places.LARGER_DEGREES[0])
             soft = with_light(dark, spare[0], turn=turn, flux=flux, size=size)
             centre = with_light(start, spare[0], turn=turn, flux=flux, size=size)
             yield k, SOFTENED, soft, centre, _unlikeliness(problem, soft, sigma), 0.0

@@ -18,12 +18,12 @@ from envedit.core.arrays import tensor
 from envedit.losses import display_curve
 from envedit.transport.light_transport import LightTransport
 
-TURNS_RENDERED, TURNS_APART_TEXELS, SURE_SHARE = 3, 4, 0.5
-"""Turns that are rendered, by how many texels they differ at least, and the share of the residual below which
-the first leaves no doubt."""
-LEAST_EXPLAINED, BLOCK_ERROR_FACTOR = 0.8, 2.0
-"""A turn explains nothing where the best one leaves more than the first share of the block residual, and
-more than so many times the block transport's own error."""
+TURNS_RENDERED, TURNS_APART_TEXELS = 3, 4
+"""Turns that are rendered, and by how many texels they differ at least."""
+EXPLAINED = 0.5
+"""Share of the residual that a turn leaves at most where it explains the target."""
+BLOCK_ERROR_FACTOR = 2.0
+"""Multiples of the block transport's own error up to which a turn may explain the target, too."""
 FINEST_TEXELS = 0.02
 """Finest turn in texels."""
 WHOLE_TEXEL_DEVIATIONS = 3.0
@@ -61,7 +61,7 @@ def find(
     ``render(envmap, k)`` renders a map (H, W, 3) to (h, w, 3), linear radiance, with the same samples each
     time, those of the integer k from 0. ``picture`` (h, w, 3) is the target, ``weight`` (h, w, 1) how much
     each pixel counts. ``thorough``: turns are rendered in any case; otherwise only where the block transport
-    shows that one explains something (:data:`LEAST_EXPLAINED`, :data:`BLOCK_ERROR_FACTOR`).
+    shows that one explains it (:data:`EXPLAINED`, :data:`BLOCK_ERROR_FACTOR`).
     """
     width = envmap.shape[1]
     rendering = render(envmap, 0)
@@ -69,7 +69,7 @@ def find(
 
     # ---- Turns by whole texels, through the block transport
     misfit, least = _at_a_glance(transport, envmap, picture, weight, rendering)
-    explains = misfit.min() <= max(LEAST_EXPLAINED**2 * misfit[0], BLOCK_ERROR_FACTOR**2 * least)
+    explains = misfit.min() <= max(EXPLAINED**2 * misfit[0], BLOCK_ERROR_FACTOR**2 * least)
     if not (thorough or explains):
         return Turn(0.0, known[0.0], known[0.0])
     best: list[int] = []
@@ -85,7 +85,7 @@ def find(
             known[texels] = apart(render(latlong.rotate(envmap, 360 * texels / width), 0), picture, weight)
         return known[texels]
 
-    sure = error(best[0]) < SURE_SHARE * known[0.0]
+    sure = error(best[0]) < EXPLAINED * known[0.0]
     texels: float = best[0] if sure else min(best, key=error)
     for step in (2.0,) if sure else (4.0, 2.0):
         texels = min((texels, texels - step, texels + step), key=error)

@@ -32,18 +32,12 @@ pytestmark = pytest.mark.usefixtures("isolated")
 COMPLETE = FILES | INFLUENCE
 TABLES = {
     "representation": {"kind": "siren", "hidden": 16, "depth": 1},  # it keeps a fit
-    "optimizer": {"iterations": 25, "checkpoint_s": 0.0},  # checkpoints after 10, 20 and 25
+    "optimizer": {"iterations": 3, "checkpoint_s": 0.0},  # a checkpoint a step
 }
 
 
 class Killed(BaseException):
     """Nothing catches it."""
-
-
-@pytest.fixture(autouse=True)
-def steady(monkeypatch):
-    """Let checkpoints come by the count of steps alone."""
-    monkeypatch.setattr(adam_loop, "READ_SECONDS", 1e9)
 
 
 @pytest.fixture(scope="module")

@@ -101,7 +101,7 @@ STAGES = ("map", "picture", "slope of map", "slope of picture", *TERMS, "dists")
 @pytest.mark.slow
 @pytest.mark.parametrize("value", BAD_VALUES)
 @pytest.mark.parametrize("stage", STAGES)
-def test_bad_steps_at_any_stage_are_counted_and_survived(stage, value, monkeypatch, every_step):
+def test_bad_steps_at_any_stage_are_counted_and_survived(stage, value, monkeypatch):
     arguments, seen = spoiled(stage, {5, 6, 12}, value, monkeypatch), []
     seen.append(arrays(arguments[1]))
     params, state = adam_loop.optimise(
@@ -136,7 +136,7 @@ def test_a_stage_that_stays_bad_ends_the_loop_with_the_last_good_parameters(stag
 @pytest.mark.slow
 @pytest.mark.parametrize("value", BAD_VALUES)
 @pytest.mark.parametrize("part", ["_m", "_v"])
-def test_moments_that_are_not_finite_reach_no_parameter(part, value, every_step):
+def test_moments_that_are_not_finite_reach_no_parameter(part, value):
     """One bad element, as a faulty memory makes it. An infinite v alone would give steps of zero for ever."""
     arguments, _ = case(np.random.default_rng(0), iterations=60)
     adam, state = optimizer.Adam(arguments[1], 0.02, (0.9, arguments[6].beta2)), adam_loop.State()

@@ -191,7 +191,7 @@ def test_observer_is_told_of_every_row_and_of_the_end(rng):
     assert all(step == rows for step, rows in seen)
 
 
-def test_what_an_observer_raises_ends_the_run(rng, every_step):
+def test_what_an_observer_raises_ends_the_run(rng):
     arguments, _ = case(rng)
 
     def stop(state, adam):
@@ -208,7 +208,7 @@ def test_what_an_observer_raises_ends_the_run(rng, every_step):
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf])
-def test_bad_renderings_are_counted_taken_back_and_halve_the_rate(value, rng, every_step):
+def test_bad_renderings_are_counted_taken_back_and_halve_the_rate(value, rng):
     """The step that led to a bad rendering is undone, and good steps win the rate back, ten for a halving."""
     arguments, _ = case(rng, iterations=8, lr=0.02, bad={2, 3, 6}, value=value)
     seen = [arrays(arguments[1])]
@@ -235,7 +235,7 @@ def test_nineteen_bad_steps_in_a_row_are_survived(rng):
 
 
 @pytest.mark.parametrize("cut", [1, 4, 7, 10, 15])
-def test_a_run_that_is_cut_and_continued_gives_the_same_bits(cut, rng, every_step):
+def test_a_run_that_is_cut_and_continued_gives_the_same_bits(cut, rng):
     """Also where the next step is a bad one, and the step before the cut has to be taken back."""
 
     def fresh():

@@ -29,15 +29,13 @@ def test_only_pixels_without_paint_that_count_have_changed():
     [
         (1, 0.019, None),
         (1, 0.0199, None),
-        (1, 0.0201, 1.5),
-        (1, 0.04, 4),
-        (4, 0.04, 16),
-        (1, 1.0, 16),
+        (1, 0.0201, 4),
+        (4, 1.0, 16),
         (200, 1.0, 256),
         (hold.LARGEST_HOLD, 1.0, None),
     ],
 )
-def test_the_weight_grows_with_the_square_of_a_visible_change(before, changed, after):
+def test_the_weight_grows_where_the_change_is_visible(before, changed, after):
     found = further(before, changed)
     assert found is None if after is None else found == pytest.approx(after)
 

@@ -8,6 +8,7 @@ from envedit.core.color import luminance
 from envedit.core.resampling import fit
 from envedit.images import images
 from envedit.report import preview
+from envedit.solve.feasibility import Reach
 from tests.oracles.builders import grey, read_png
 
 
@@ -133,3 +134,12 @@ def test_the_scale_of_a_difference_is_round(stops, rounded):
     b = grey(1.0)
     a = (b + 1e-3) * 2**stops - 1e-3  # both are lifted by a thousandth of the median
     assert preview.difference_image(a, b, "stops")[1] == pytest.approx(rounded)
+
+
+def test_colours_show_sign_and_size():
+    residual = np.zeros((1, 4, 3), np.float32)
+    residual[0, 1] = [0.1, -0.05, 0]
+    residual[0, 2] = -preview.FULL_COLOUR_DIFFERENCE / 2
+    residual[0, 3] = 1
+    shown = preview.unreachable(Reach(0.5, residual, residual, residual))
+    np.testing.assert_allclose(shown[0], [[1, 1, 1], [1, 0.6, 0.6], [0.5, 0.5, 1], [1, 0, 0]], atol=1e-6)

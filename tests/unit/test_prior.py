@@ -86,7 +86,7 @@ def test_without_freedom_the_sky_has_one_factor():
             between = variance[:, None] + variance - 2 * covariance
             apart.append(np.sqrt(np.maximum(between, 0).max()))
         assert apart[0] < 0.02 * apart[1] and apart[0] < 0.03
-    np.testing.assert_array_equal(finest(0.0), finest(prior.LEAST_FREEDOM))
+    np.testing.assert_array_equal(finest(0.0), finest(np.sqrt(prior.LEAST_VARIANCE)))
 
 
 def test_coarser_grids_stay_where_the_finest_has_all_and_ground_changes_as_a_sky():

@@ -40,7 +40,7 @@ from envedit.export import adjustments, file_resolution
 from envedit.images import images, map_regions
 from envedit.losses import display_curve
 from envedit.losses.perceptual import installed
-from envedit.report import output_folder, run_folder
+from envedit.report import output_folder, preview, run_folder
 from envedit.representations.layers.lights import DARK
 from envedit.representations.layers.oriented import oriented
 from envedit.representations.layers.placed_lights import PlacedLights, angles
@@ -444,7 +444,7 @@ class Session:
     def _tell_unreachable(self):
         """Show what of the paint is not feasible, once that is known."""
         if self.reach is not None:
-            self.tell.frame("unreachable", "transport", feasibility.unreachable(self.reach), self.scene.rows)
+            self.tell.frame("unreachable", "transport", preview.unreachable(self.reach), self.scene.rows)
 
     # ---- what is shown -------------------------------------------------------------------------------------
 

@@ -13,7 +13,7 @@ from envedit import config
 from envedit.core.color import tonemap
 from envedit.solve.likelihood import VISIBLE
 
-RAISE, LARGEST_HOLD = 4.0, 256.0
+RAISE, LARGEST_HOLD = 2.0, 256.0
 """Factor by which the weight is raised at once, and the largest weight."""
 
 

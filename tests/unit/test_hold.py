@@ -29,8 +29,8 @@ def test_only_pixels_without_paint_that_count_have_changed():
     [
         (1, 0.019, None),
         (1, 0.0199, None),
-        (1, 0.0201, 4),
-        (4, 1.0, 16),
+        (1, 0.0201, 2),
+        (8, 1.0, 16),
         (200, 1.0, 256),
         (hold.LARGEST_HOLD, 1.0, None),
     ],
@@ -43,7 +43,7 @@ def test_the_weight_grows_where_the_change_is_visible(before, changed, after):
 @pytest.mark.parametrize(
     ("target", "after"),
     [
-        ({"rest": "keep"}, 4.0),
+        ({"rest": "keep"}, 2.0),
         ({"rest": "keep", "hold": 3.0}, None),
         ({"rest": "keep", "paint": 0.0}, None),
         ({"rest": "follow"}, None),

@@ -121,7 +121,7 @@ class Preparation:
             edit.job.layers.go_on_from(self.settings.optimizer.start, edit.params)
             return edit
         # ---- Maps that explain the target to its noise are taken as they are
-        if self._explains(0.0, target):
+        if self._explains(self.original, target):
             note = "nothing changed: the map already renders to the target within noise"
             return self._idle(target, 0.0, note)
         turn = self._turn(target)
@@ -129,7 +129,7 @@ class Preparation:
             return self._prepared(target, 0.0, [])
         note = f"sky turned by {turn.degrees:.2f} degrees"
         note += f": display residual {turn.still:.4f} -> {turn.error:.4f}"
-        if self._explains(turn.degrees, target):
+        if self._explains(latlong.rotate(self.original, turn.degrees), target):
             return self._idle(target, turn.degrees, f"{note}; the rest is noise, nothing else changed")
 
         # ---- Edits of the turned and of the unturned map
@@ -185,15 +185,14 @@ class Preparation:
                 thorough=chosen is True,
             )
 
-    def _explains(self, degrees, target):
-        """Whether the turned map gives the target, to the noise of a rendering with as many samples.
+    def _explains(self, envmap, target):
+        """Whether a map gives the target, to the noise of a rendering with as many samples.
 
-        Residuals of pixels and of areas are compared with those between two renderings of the turned map.
+        Residuals of pixels and of areas are compared with those between two renderings of the map.
         """
         if target.spp is None:  # painted
             return False
         with self.clock("target_s"):
-            envmap = latlong.rotate(self.original, degrees)
             shown = self._shown(envmap, target, "turn_check")
             misfits = _misfits(shown, target.picture, target.known_weight)
             # A mean of n values in [0, 1] has a standard error of at most 1 / (2 sqrt(n)).
@@ -246,6 +245,22 @@ class Preparation:
             dists=self.dists,
         )
 
+        # ---- Which lights, and where; which pixels count, and whether coarse grids are not enough
+        if recordings and (settings.optimizer.iterations or not job.newton):
+            with self.clock("start_s"):
+                params, run = self._explained(job, params, octaves, notes, recordings.transport)
+            if octaves:
+                envmap = original.copy()
+                envmap[representation.active] = representation.decode(params).numpy()
+                if self._explains(envmap, target):
+                    notes.append("coarse grids explain the target to its noise: no finer ones are solved for")
+                    octaves = []
+                else:
+                    job.target, more = initialization.trusted(envmap, recordings, job.target)
+                    notes += more
+            if job.newton and not octaves:
+                job.layers.begun = run
+
         # ---- Which texels keep their value: none for Gauss-Newton, whose prior holds what is not determined
         frozen = None
         if traced := self.renderer.transport:
@@ -256,21 +271,13 @@ class Preparation:
         if self.kept is not None and kind != "layers":  # which know it themselves
             open_texels = self.kept[rows] < map_regions.KEPT_SHARE
             job.free = open_texels if job.free is None else job.free & open_texels
+
+        # ---- Finer grids
         if recordings:
             representation = representation.keeping(job.free)
             job.representation = representation
             job.free = None  # the gain keeps to them, while a light may move across the others
             notes += recordings.notes
-
-        # ---- Which lights, and where; then which pixels count, and finer grids
-        if recordings and (settings.optimizer.iterations or not job.newton):
-            with self.clock("start_s"):
-                params = self._explained(job, params, octaves, notes, recordings.transport)
-            if octaves:
-                envmap = original.copy()
-                envmap[representation.active] = representation.decode(params).numpy()
-                job.target, more = initialization.trusted(envmap, recordings, job.target)
-                notes += more
         if octaves:
             job.representation = representation.refined(octaves)
             params = job.representation.start() | params
@@ -294,22 +301,21 @@ class Preparation:
         )
 
     def _explained(self, job, params, octaves, notes, transport):
-        """Find the lights that explain the target, and for Adam the sky; returns parameters."""
+        """Find the lights that explain the target, and for Adam the sky; returns parameters and the run."""
         self.watch.stage("searching for lights")
         explanation = job.layers.explain(params, transport)
         subject = "the target" if job.rendered else "the paint"
         evidence = f"-2 log evidence {explanation.score:.1f}"
         notes.append(f"likeliest explanation of {subject}: {explanation.name} ({evidence})")
         if job.newton and not octaves:
-            job.layers.begun = explanation.run
-            return params
+            return params, explanation.run
         self.watch.stage("solving for lights and coarse gain")
         try:
             solved = job.layers.solved(params, explanation.run, transport)
         except NumericalError:  # a start that goes nowhere is no reason to stop
-            return params
+            return params, explanation.run
         # What ground is lit by from elsewhere makes up for what coarse grids cannot show.
-        return params | {name: solved[name] for name in solved if name != "ground"}
+        return params | {name: solved[name] for name in solved if name != "ground"}, explanation.run
 
     def _recorded(self, representation, target):
         """Return what is looked through for where layers start; None for what is fitted."""

@@ -161,17 +161,24 @@ def agree(outcome, kind, said):
 
 HEAD = """# Extremes
 
-What happens where a map, a target or a scene is as odd as it can be. This page is written from the tests
-(`python -m tests.oracles.extremes > docs/extremes.md`), which check every exception and a third of the other
-cells; the command checks all. *ok*: the result is finite and correct, by the definition of its stage; a
-number in brackets is a note below on what is correct there. *refused*: with the words of the note. *seen*:
-the stage's value is not finite, and a later stage detects it.
+What happens where a map, a target or a scene is as odd as it can be, written by the tests
+(`python -m tests.oracles.extremes > docs/extremes.md`). *ok*: the result is finite and correct, by the
+definition of its stage. *refused*: with an error that says where and why. *seen*: the stage's value is not
+finite, and a later stage detects it. A number in brackets is a note below.
 """
 
 
 def first_line(act):
     """Return a docstring's first line as the end of a list item."""
     return " ".join(act.__doc__.split())
+
+
+def together(named):
+    """List the names of each value, in the order of their first."""
+    found = {}
+    for name, value in named.items():
+        found.setdefault(value, []).append(name)
+    return found
 
 
 def table(rows, columns, outcome):
@@ -185,16 +192,17 @@ def table(rows, columns, outcome):
         if found.kind == "done" and not found.says:
             return "ok"
         text = found.says
-        if found.kind == "refused":
-            text = f'`{found.error.__name__}`, "{found.words}". {text}'.strip()
-        elif found.kind == "seen":
+        if found.kind == "refused" and not text:
+            return "refused"
+        if found.kind == "seen":
             text = f"Not finite, and seen: {found.words}. {text}".strip()
         if text not in notes:
             notes.append(text)
         return f"{'ok' if found.kind == 'done' else found.kind} [{notes.index(text) + 1}]"
 
     lines = [f"| | {' | '.join(columns)} |", "|---" * (len(columns) + 1) + "|"]
-    lines += [f"| {row} | {' | '.join(mark(row, column) for column in columns)} |" for row in rows]
+    marks = {row: " | ".join(mark(row, column) for column in columns) for row in rows}
+    lines += [f"| {', '.join(alike)} | {cells} |" for cells, alike in together(marks).items()]
     return lines + ["", *(f"{i}. {note}" for i, note in enumerate(notes, 1))]
 
 
@@ -222,8 +230,9 @@ def document():
         "Largest error over the range, relative unless said otherwise.",
         "",
     ]
-    lines += ["| what | range | bound | why |", "|---|---|---|---|"]
-    lines += [f"| {name} | {c.range} | {c.bound:.0e} | {c.why} |" for name, c in CHECKS.items()]
+    lines += ["| what | range | bound |", "|---|---|---|"]
+    bounds = {name: f"{c.range} | {c.bound:.0e}" for name, c in CHECKS.items()}
+    lines += [f"| {', '.join(alike)} | {cells} |" for cells, alike in together(bounds).items()]
     return "\n".join(lines) + "\n"
 
 

@@ -216,42 +216,26 @@ def installed() -> set[str]:
 HEAD = """\
 # Scenes
 
-What happens with scenes as people have them. Both tables are written from the tests
-(`python -m tests.oracles.users_scenes > docs/scenes.md`). Scenes of each kind are rendered by plain Mitsuba
-and by envedit, or the words of the refusal are looked for. The list of plugins is that of Mitsuba 3.9; those
-that are refused or replaced are tried one by one, the others are Mitsuba's own and are not touched.
+What happens with scenes of each kind, and with each plugin of Mitsuba 3.9. Tests check both tables
+(`python -m tests.oracles.users_scenes > docs/scenes.md` writes the page).
 
-- **The map.** Without `--envmap` (`[input] envmap`), or with `envmap = "scene"`, the light of the scene's
-  environment emitter is edited: the file of an `envmap`, or the `bitmap` that Python gave it; `constant`,
-  `sunsky` and `timed_sunsky` are rendered to a map of `[input] width` texels. An `envmap` without a file name
-  is refused. With `--envmap`, the map takes the place of the emitter, or lights a scene without one beside
-  its lamps, and a run says how much of the picture's light it gives.
-- **Orientation and scale.** Whatever the map, the `to_world` and `scale` of an `envmap` apply, and a run says
-  so where `scale` is not 1; `[scene] scale` is a number in place of the emitter's, and 1 drops it. The zenith
-  of `sunsky` is +z. For `constant` and without an emitter, the zenith is the one of x, y and z that is up for
-  the first sensor, or `[scene] up`. `edited.exr` is what takes the place of the file: `scale` is not in it.
-- **Shipped scenes** are made for any map: their `<emitter type="constant" id="placeholder"/>` is no light of
-  its own, and without `--envmap` an analytic sky lights them.
-- **The picture** is the one that Mitsuba makes of the file, to its noise: camera, crop, path depth and hidden
-  emitters are the file's, `[scene] width` is its size; of a cropped film, that of the crop, which keeps its
-  part of the film to half a pixel. A sensor without a film has Mitsuba's, 768 x 576. Light of other lamps
-  stays as it is.
-- **Several views.** `[scene] sensors = "all"`, or a list of sensors by `id` or by index from 0, makes every
-  one of them a picture, and one map is found for all; without it the first sensor is used. Views need the
-  same width, which `[scene] width` gives to all; `renderer.kind = "path"` is refused with more than one.
-- **Variants.** Everything runs in `llvm_ad_rgb` and, on an NVIDIA GPU, in `cuda_ad_rgb`; `metal_ad_rgb` can
-  be chosen and was not tried. Spectra are converted to RGB when a scene is loaded, as Mitsuba does.
-  Spectral and polarised rendering are not supported: polarising materials act on unpolarised light, which
-  is said.
-- **Measured** ([experiments/scenes](../experiments/scenes/README.md)): `python -m experiments scenes run
-  FOLDER` loads, renders and edits every Mitsuba scene of a folder, such as a clone of
-  [mitsuba-data](https://github.com/mitsuba-renderer/mitsuba-data). Of the six shipped scenes five are edited,
-  and `mesh` is refused without a mesh; all five initial renderings have Mitsuba's mean to 0.5 % or to their
-  noise, and all five edited renderings are nearer the target. Of mitsuba-data, `matpreview` and
-  `principled_blend_creation` were tried: both are edited; the first is as Mitsuba renders it, the second has
-  names of plugins that Mitsuba 3.9 itself refuses.
-- **Refused by name:** a `to_world` of the map that mirrors or shears, and what the tables say. All that is
-  refused of a scene is said at once.
+- **The map.** Without `--envmap` (`[input] envmap`), or with `envmap = "scene"`, the scene's environment
+  emitter is edited: the file of an `envmap`, or a map that `constant`, `sunsky` and `timed_sunsky` are
+  rendered to. With `--envmap`, the map takes its place or lights a scene without one. Without it, shipped
+  scenes are lit by an analytic sky.
+- **Orientation and scale.** The `to_world` and `scale` of an `envmap` apply to any map; `[scene] scale`
+  replaces the scale, which is not in `edited.exr`. The zenith of `sunsky` is +z; for `constant`, and without
+  an emitter, it is the axis that is up for the first sensor, or `[scene] up`.
+- **The picture** is Mitsuba's, to its noise. `[scene] width` is its size, or that of the film's
+  crop.
+- **Several views.** `[scene] sensors = "all"`, or a list by `id` or by index from 0, makes every one a
+  picture; without it the first is used. They need the same width, and not `renderer.kind = "path"`.
+- **Variants.** `llvm_ad_rgb` and, on an NVIDIA GPU, `cuda_ad_rgb`; `metal_ad_rgb` was not tried. Spectra are
+  converted to RGB. Spectral and polarised rendering are not supported.
+- **Your scenes.** `python -m experiments scenes run FOLDER` loads, renders and edits every Mitsuba scene of a
+  folder ([results](../experiments/scenes/README.md)).
+- **Refused**, with all reasons at once: a `to_world` of the map that mirrors or shears, and what the tables
+  say.
 """
 
 

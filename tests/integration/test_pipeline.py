@@ -572,6 +572,27 @@ def test_a_mirror_gets_finer_grids_and_more_samples_and_goes_on_where_it_stopped
 
 
 @pytest.mark.slow
+def test_a_mirror_gets_no_finer_grids_where_coarse_ones_explain_the_target(tmp_path, rng):
+    picture = np.exp(rng.normal(0, 0.5, (32, 64, 1)) + rng.normal(0, 0.1, (32, 64, 3))).astype(np.float32)
+    images.write_exr(tmp_path / "brighter.exr", 1.3 * picture)
+    settings = settings_of(
+        tmp_path,
+        picture,
+        input={"width": 64},
+        scene={"file": "mirror", "width": 48},
+        representation={"cycles": "auto"},
+        target={"file": str(tmp_path / "brighter.exr")},
+        renderer={"pixels": 36 * 32},
+    )
+    brighter = pipeline.run(settings)
+    assert any("identifiable detail: " in note and "24 cycles" in note for note in brighter.notes)
+    assert any("coarse grids explain the target" in note for note in brighter.notes)
+    assert len([name for name in brighter.found.params if name.startswith("gain.")]) == gain.LEVELS
+    seen = brighter.influence > np.median(brighter.influence)
+    assert np.median(brighter.envmap[seen] / picture[seen]) == pytest.approx(1.3, abs=0.05)
+
+
+@pytest.mark.slow
 def test_an_interrupted_run_of_the_path_tracer_goes_on_where_it_stopped(tmp_path, rng, monkeypatch):
     """Mitsuba adds the gradients of a texel in any order: its runs agree but for the last bits."""
     renderer = {"kind": "path", "spp": 4, "max_depth": 3}

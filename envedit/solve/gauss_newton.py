@@ -20,11 +20,12 @@ from envedit.solve.map_problem import Point, Posterior, Problem
 
 MOST_STEPS, LEAST_DECREASE = 16, 2e-3
 """Most steps, and the relative decrease of F below which no further step is made."""
-DAMPINGS_TRIED = 6
+DAMPINGS_TRIED = 5
 """Dampings that are tried in one step."""
-LEAST_DAMPING, DAMPING_FACTOR = 1e-4, 10.0
-"""Damping at first and at least, and by how much it rises after a step that does not lower F, and falls after
-one that does (Marquardt)."""
+DAMPING_FACTOR = 10.0
+"""By how much damping rises after a step that does not lower F, and falls after one that does (Marquardt)."""
+FIRST_DAMPING, LEAST_DAMPING, RAISED_DAMPING = 1e-3, 1e-4, 1e-2
+"""Damping at first, at least, and at least after a step that did not lower F."""
 COMPARED_NOISE_RATIO, KEPT_ERROR_SHARE = 2.0, 0.95
 """Noise of the start over that of the solution up to which their renderings are compared, and the share of
 the start's squared error that the solution's must be below."""
@@ -39,7 +40,7 @@ class Run:
     state: dict
     start: dict
     # damping, scale: of the next step; the threshold s
-    damping: float = LEAST_DAMPING
+    damping: float = FIRST_DAMPING
     scale: float = np.inf
     finished: bool = False  # no further step is made
     # A row a step: ``loss`` F, its parts ``data`` and ``prior``, the ``sigma`` at which they were taken,
@@ -240,5 +241,5 @@ def _lower(problem, run, point, normal):
                     point, before = again, problem.loss(again, run.start, run.scale)
             if trial.loss < before:
                 return point, before, trial
-        run.damping *= DAMPING_FACTOR
+        run.damping = max(DAMPING_FACTOR * run.damping, RAISED_DAMPING)
     return point, before, None

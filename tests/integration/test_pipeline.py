@@ -542,20 +542,25 @@ def test_an_interrupted_gauss_newton_run_ends_with_the_same_bits(tmp_path, rng, 
     assert_same(resumed, whole)
 
 
+MIRROR = {
+    "input": {"width": 64},
+    "scene": {"file": "mirror", "width": 48},
+    "representation": {"cycles": "auto"},
+}
+
+
+def detailed(rng):
+    """Return a map of 64x32 texels whose detail a mirror shows."""
+    return np.exp(rng.normal(0, 0.5, (32, 64, 1)) + rng.normal(0, 0.1, (32, 64, 3))).astype(np.float32)
+
+
 @pytest.mark.slow
 def test_a_mirror_gets_finer_grids_and_more_samples_and_goes_on_where_it_stopped(tmp_path, rng, monkeypatch):
     monkeypatch.setattr(recording, "PATHS", 32 * 48**2)
     monkeypatch.setattr(recording, "MOST_SPP", 128)
-    picture = np.exp(rng.normal(0, 0.5, (32, 64, 1)) + rng.normal(0, 0.1, (32, 64, 3))).astype(np.float32)
-    settings = settings_of(
-        tmp_path,
-        picture,
-        input={"width": 64},
-        scene={"file": "mirror", "width": 48},
-        representation={"cycles": "auto"},
-        target={"rotate_degrees": 90},
-        renderer={"spp": "auto", "pixels": 36 * 32},  # detail is solved for on every pixel
-    )
+    picture = detailed(rng)
+    renderer = {"spp": "auto", "pixels": 36 * 32}  # detail is solved for on every pixel
+    settings = settings_of(tmp_path, picture, target={"rotate_degrees": 90}, renderer=renderer, **MIRROR)
     whole = pipeline.run(settings)
     assert not any("solved on" in note for note in whole.notes)
     assert whole.metrics["transport"]["samples"] == 128
@@ -573,17 +578,10 @@ def test_a_mirror_gets_finer_grids_and_more_samples_and_goes_on_where_it_stopped
 
 @pytest.mark.slow
 def test_a_mirror_gets_no_finer_grids_where_coarse_ones_explain_the_target(tmp_path, rng):
-    picture = np.exp(rng.normal(0, 0.5, (32, 64, 1)) + rng.normal(0, 0.1, (32, 64, 3))).astype(np.float32)
+    picture = detailed(rng)
     images.write_exr(tmp_path / "brighter.exr", 1.3 * picture)
-    settings = settings_of(
-        tmp_path,
-        picture,
-        input={"width": 64},
-        scene={"file": "mirror", "width": 48},
-        representation={"cycles": "auto"},
-        target={"file": str(tmp_path / "brighter.exr")},
-        renderer={"pixels": 36 * 32},
-    )
+    target = {"file": str(tmp_path / "brighter.exr")}
+    settings = settings_of(tmp_path, picture, target=target, renderer={"pixels": 36 * 32}, **MIRROR)
     brighter = pipeline.run(settings)
     assert any("identifiable detail: " in note and "24 cycles" in note for note in brighter.notes)
     assert any("coarse grids explain the target" in note for note in brighter.notes)

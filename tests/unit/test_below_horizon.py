@@ -83,6 +83,21 @@ def test_a_mirror_follows_a_factor_and_ground_fades(factor):
     assert (np.diff(found.mean(axis=(1, 2))) < 0).all()
 
 
+def test_ground_follows_the_glow_above_it_as_far_as_it_continues_the_sky(rng):
+    """Walls go on below the horizon; a field of one colour never had the glow of the sun above it."""
+    low, sky = halves(mirror(sun=(12, 20)))
+    sunless = halves(mirror())[1]
+    factors = {}
+    for share in (0.0, 0.5, 1.0):
+        below = Below(0.2 * low**share, sky, "keep")
+        factors[share] = below.log_factor(tensor(sunless)).numpy()
+    assert not factors[0.0].any()
+    assert factors[1.0].min() < -0.3
+    np.testing.assert_allclose(factors[0.5], 0.5 * factors[1.0], rtol=0.02, atol=1e-3)
+    opposite = Below(0.2 / low, sky, "keep")
+    assert not opposite.log_factor(tensor(sunless)).numpy().any()
+
+
 def test_a_mirror_turns_with_its_sky():
     """The truth is the turned map; as it is, the lower half is three times as far from it and more."""
     image = mirror((64, 128), sun=None)

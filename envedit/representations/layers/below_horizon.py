@@ -12,7 +12,8 @@ Gaussian on the sphere that widens with the angle below the horizon. b goes from
 :data:`BLEND_DEGREES`, so that there is no edge. Cores are left out, as they are far too bright for a ratio;
 the reflection of a core goes with its glow (:meth:`Below.reveal`).
 
-f is 1 for a mirror; for ground it falls off with the angle (:data:`FADE_DEGREES`). Farther down, ground
+f is 1 for a mirror. For ground it is how far its rows near the horizon continue the sky's pattern in the
+original (:meth:`Below._continued`), and falls off with the angle (:data:`FADE_DEGREES`). Farther down, ground
 follows its irradiance H (``ground_light.py``), or keeps its brightness where that would need an implausible
 albedo. a is an unknown of the edit, 1 where the picture does not determine it: light from the side, or
 another ground.
@@ -127,7 +128,10 @@ class Below:
 
         # ---- How far each row follows the mirrored sky, sharp and blurred
         angle = np.degrees(np.pi * np.arange(up, total) / max(total - 1, 1)) - 90
-        self.fade = np.ones(low) if kind == "mirror" else np.exp(-angle / FADE_DEGREES)
+        self.fade = np.ones(low)
+        if kind == "keep":
+            self.fade = np.exp(-angle / FADE_DEGREES)
+            self.fade *= self._continued(radiance, sky, self.fade)
         self._blend = np.clip(angle / BLEND_DEGREES, 0, 1)
         self._sharp = tensor(((1 - self._blend) * self.fade)[:, None])
         self._soft = tensor((self._blend * self.fade)[:, None])
@@ -166,22 +170,34 @@ class Below:
         """How far each row follows the light that falls on it, (rows,)."""
         return np.zeros_like(self.fade) if self.light is None else 1 - self.fade
 
+    def _varying(self, image):
+        """Return how the log luminance of each row of (rows, W, 3) varies around the horizon, (rows, W)."""
+        logs = np.log(image.astype(np.float64) @ LUMINANCE + self._faint)
+        return logs - logs.mean(axis=1, keepdims=True)
+
+    def _continued(self, radiance, sky, weight):
+        """Return which share of the mirrored sky's pattern is in the ground: a slope, from 0 to 1.
+
+        By least squares over rows of a ``weight`` (rows,). Walls go on below the horizon; open ground is
+        lit by all of the sky, and has nothing of the glow above it.
+        """
+        original = self._varying(radiance)
+        mirrored = self._varying(sky[: len(radiance)][::-1])
+        square = weight @ np.square(mirrored).sum(axis=1)
+        product = weight @ (mirrored * original).sum(axis=1)
+        return np.clip(product / square, 0, 1) if square > 0 else 0.0
+
     def _best_width(self, radiance, sky, total):
         """Choose the widest K by how well K S_0 explains the variation of each row around the horizon."""
         blur = _Blur(sky.shape[:2], total, CHOICE_COLUMNS)
         omega = latlong.solid_angles(total, sky.shape[1])[sky.shape[0] :]
-
-        def varying(image):
-            logs = np.log(image.astype(np.float64) @ LUMINANCE + self._faint)
-            return logs - logs.mean(axis=1, keepdims=True)
-
-        original = varying(radiance)
+        original = self._varying(radiance)
         errors = []
         for widest in BLUR_MOST_DEGREES:
             blur.widen(widest)
             soft = blur(tensor(sky)).numpy().reshape(*blur.grid, 3)
             soft = np.einsum("ri,ijx,cj->rcx", blur.down[self.mirrored], soft, blur.across, optimize=True)
-            errors.append(omega @ np.square(varying(soft) - original).mean(axis=1))
+            errors.append(omega @ np.square(self._varying(soft) - original).mean(axis=1))
         return BLUR_MOST_DEGREES[int(np.argmin(errors))]
 
     def reveal(self, log_change: np.ndarray, gone: np.ndarray, near: np.ndarray) -> None:

@@ -108,6 +108,12 @@ def lookup_solid_angles(height: int, width: int) -> np.ndarray:
     return weight * (2 * np.pi / width)
 
 
+def level_weights(height: int, width: int) -> np.ndarray:
+    """Return what one texel of each row, of radiance 1, adds to the irradiance of level ground, ``(H,)``."""
+    cosine = directions(height, 1)[:, 0, 1]
+    return lookup_solid_angles(height, width) * np.maximum(cosine, 0)
+
+
 def _caps(v):
     """Return cos(pi v[i]) - cos(pi v[i+1]) without cancellation: the solid angle between two v over 2 pi."""
     a, b = np.pi * v[:-1], np.pi * v[1:]

@@ -59,9 +59,7 @@ def ground_irradiance(sky: np.ndarray, rows: tuple[int, int]) -> float:
     ``rows`` are its first row in the map, and the rows of the map; those below the horizon light nothing.
     """
     first, total = rows
-    polar = np.pi * np.arange(first, first + len(sky)) / max(total - 1, 1)
-    cosine = np.maximum(np.cos(polar), 0)
-    weight = latlong.lookup_solid_angles(total, sky.shape[1])[first : first + len(sky)] * cosine
+    weight = latlong.level_weights(total, sky.shape[1])[first : first + len(sky)]
     return float(weight @ (sky.astype(np.float64) @ LUMINANCE).sum(axis=1))
 
 

@@ -37,8 +37,7 @@ class GroundLight:
     def __init__(self, above: np.ndarray, ground: np.ndarray):
         up, width, _ = above.shape
         total = len(above) + len(ground)
-        cosine = np.maximum(latlong.directions(total, width)[:up, :1, 1], 0)
-        self.cosine = latlong.lookup_solid_angles(total, width)[:up, None] * cosine
+        self.cosine = latlong.level_weights(total, width)[:up, None]
         self.initial = self.irradiance(above)
         light = float(self.initial @ LUMINANCE)
         radiance = float(np.median(ground @ LUMINANCE))

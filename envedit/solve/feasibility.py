@@ -39,8 +39,9 @@ from envedit.transport.light_transport import LightTransport
 
 SHARP_SAMPLES = 4.0
 """Samples behind an entry of T from which on the texels of a cell are distinguished."""
-LINEARISATIONS, STEPS = 2, 40
-"""How often the display curve is linearised, and steps of the solution each time."""
+LINEARISATIONS, STEPS = 8, 10
+"""How often the display curve is linearised, and steps of the solution each time. Measured:
+docs/decisions/cells_of_feasibility.md."""
 METRIC_FLOOR = 0.1
 """Share of the mean that the metric takes every cell to have at least: what is dark can grow."""
 LEAST_SLOPE_SPAN = 1e-3
@@ -266,6 +267,7 @@ def _solution(transport, original, active, request):
     x, light = np.stack([gain * ones, zeros]), gain * light
     one = render(np.stack([zeros, ones]))
 
+    z, z_light, momentum = x, light, np.ones(3)
     for _ in range(LINEARISATIONS):
         weight, share = request.weights(fixed + light), request.mean_of_rest(fixed + light)
 
@@ -282,8 +284,7 @@ def _solution(transport, original, active, request):
         used = metric > 1e-9 * metric.max(axis=1, keepdims=True)
         step = np.where(used, 1 / np.maximum(metric, 1e-300), 0)
 
-        # ---- Accelerated projected gradient, each channel by itself
-        z, z_light, momentum = x, light, np.ones(3)
+        # ---- Accelerated projected gradient, each channel by itself; its momentum outlives a linearisation
         for _ in range(STEPS):
             residual = aim - z_light
             gradient = -pulled(np.where(white, np.maximum(residual, 0), residual))

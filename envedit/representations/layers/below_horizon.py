@@ -175,17 +175,15 @@ class Below:
         logs = np.log(image.astype(np.float64) @ LUMINANCE + self._faint)
         return logs - logs.mean(axis=1, keepdims=True)
 
-    def _continued(self, radiance, sky, weight):
-        """Return which share of the mirrored sky's pattern is in the ground: a slope, from 0 to 1.
+    def _continued(self, radiance, sky, fade):
+        """Return the share, 0 to 1, with which the mirrored sky's pattern, faded, explains the ground's.
 
-        By least squares over rows of a ``weight`` (rows,). Walls go on below the horizon; open ground is
-        lit by all of the sky, and has nothing of the glow above it.
+        By least squares. Walls go on below the horizon; open ground has nothing of the glow above it.
         """
         original = self._varying(radiance)
-        mirrored = self._varying(sky[: len(radiance)][::-1])
-        square = weight @ np.square(mirrored).sum(axis=1)
-        product = weight @ (mirrored * original).sum(axis=1)
-        return np.clip(product / square, 0, 1) if square > 0 else 0.0
+        mirrored = self._varying(sky[: len(radiance)][::-1]) * fade[:, None]
+        square = np.square(mirrored).sum()
+        return np.clip((mirrored * original).sum() / square, 0, 1) if square > 0 else 0.0
 
     def _best_width(self, radiance, sky, total):
         """Choose the widest K by how well K S_0 explains the variation of each row around the horizon."""

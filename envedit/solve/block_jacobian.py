@@ -43,9 +43,12 @@ class BlockJacobian:
                 one = one + np.bincount(self._cell * nodes + node, share * sky, cells * nodes)
             hats.append(one.reshape(cells, nodes) / light[:, None])
         if layers.ground_light:  # what the sky does to it, and its own factor
-            lit = np.bincount(self._cell, np.repeat(layers.lit, shape[1]) * sky, cells) / light
+            lit, own = (
+                np.bincount(self._cell, np.repeat(rows, shape[1]) * sky, cells) / light
+                for rows in (layers.lit, layers.own_ground)
+            )
             hats = [one + np.outer(lit, layers.lighting(level)) for level, one in enumerate(hats)]
-            hats.append(lit[:, None])
+            hats.append(own[:, None])
         used = np.bincount(self._cell, minlength=cells) > 0
         self._used = np.flatnonzero(used)
         self._hats = np.concatenate(hats, axis=1)[used].astype(np.float32)

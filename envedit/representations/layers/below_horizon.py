@@ -3,7 +3,7 @@
 On PureSky maps they are a blurred mirror of the sky; on others they are photographed ground. Either way they
 are the original's, times a smooth factor, the change of the sky above:
 
-    E_low = E0_low * R^f * (a H / H_0)^(1 - f),
+    E_low = E0_low * R^f * (H / H_0)^(1 - f) * a^(1 - e),      f = s e,
     log R = (1 - b) log(S(m) / S_0(m)) + b log(K S(m) / K S_0(m))
 
 S and S_0 are the sky after the edit and before, without cores of lights, and with some of its luminance in
@@ -12,11 +12,12 @@ Gaussian on the sphere that widens with the angle below the horizon. b goes from
 :data:`BLEND_DEGREES`, so that there is no edge. Cores are left out, as they are far too bright for a ratio;
 the reflection of a core goes with its glow (:meth:`Below.reveal`).
 
-f is 1 for a mirror. For ground it is how far its rows near the horizon continue the sky's pattern in the
-original (:meth:`Below._continued`), and falls off with the angle (:data:`FADE_DEGREES`). Farther down, ground
-follows its irradiance H (``ground_light.py``), or keeps its brightness where that would need an implausible
-albedo. a is an unknown of the edit, 1 where the picture does not determine it: light from the side, or
-another ground.
+f is 1 for a mirror. For ground, e falls off with the angle below the horizon (:data:`FADE_DEGREES`), and s
+is how far the ground continues the sky's pattern in the original (:meth:`Below._continued`). Farther down,
+ground follows its irradiance H (``ground_light.py``), or keeps its brightness where that would need an
+implausible albedo. a is an unknown of the edit, 1 where the picture does not determine it: light from the
+side, or another ground. At the horizon it has no effect, as texels there are interpolated with the sky's: it
+would make up for what is wrong with the sky.
 """
 
 from __future__ import annotations
@@ -111,9 +112,10 @@ class Below:
     above, without cores of lights, and ``above`` these with cores: ground is lit by them, or keeps its
     brightness without. ``kind`` is "mirror" or "keep".
 
-    Of each row, (rows,), ``mirrored`` is the row of the sky that it mirrors and ``fade`` its f. ``widest`` is
-    the greatest standard deviation of K, degrees. ``light`` is what falls on ground that it lights; None of a
-    mirror, and of ground that keeps its brightness.
+    Of each row, (rows,), ``mirrored`` is the row of the sky that it mirrors, ``fade`` its f, and
+    ``own_ground`` how far it has the ground's own factor a, 1 - e. ``widest`` is the greatest standard
+    deviation of K, degrees. ``light`` is what falls on ground that it lights; None of a mirror, and of ground
+    that keeps its brightness.
     """
 
     def __init__(self, radiance: np.ndarray, sky: np.ndarray, kind: str, above: np.ndarray | None = None):
@@ -128,10 +130,8 @@ class Below:
 
         # ---- How far each row follows the mirrored sky, sharp and blurred
         angle = np.degrees(np.pi * np.arange(up, total) / max(total - 1, 1)) - 90
-        self.fade = np.ones(low)
-        if kind == "keep":
-            self.fade = np.exp(-angle / FADE_DEGREES)
-            self.fade *= self._continued(radiance, sky, self.fade)
+        near = np.exp(-angle / FADE_DEGREES)
+        self.fade = np.ones(low) if kind == "mirror" else near * self._continued(radiance, sky, near)
         self._blend = np.clip(angle / BLEND_DEGREES, 0, 1)
         self._sharp = tensor(((1 - self._blend) * self.fade)[:, None])
         self._soft = tensor((self._blend * self.fade)[:, None])
@@ -153,7 +153,9 @@ class Below:
         if kind == "keep" and above is not None:
             light = GroundLight(above, radiance)
             self.light = light if light.plausible else None
+        self.own_ground = np.zeros(low) if self.light is None else 1 - near
         self._lit = tensor(self.lit[:, None])
+        self._own_ground = tensor(self.own_ground[:, None])
         self._around = tensor(np.tile(np.eye(3), width))
 
     @property
@@ -227,9 +229,10 @@ class Below:
         """
         if self.light is None:
             return 0.0
-        change = self.light.log_change(sky, core)
-        change = change if ground is None else change + ground
-        return dr.matmul(self._lit, dr.matmul(change, self._around))
+        change = dr.matmul(self._lit, dr.matmul(self.light.log_change(sky, core), self._around))
+        if ground is None:
+            return change
+        return change + dr.matmul(self._own_ground, dr.matmul(ground, self._around))
 
     def log_factor(
         self,

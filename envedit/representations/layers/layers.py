@@ -456,6 +456,12 @@ class Layers:
         own = np.zeros(self.shape[0])
         return own if self.below is None else np.concatenate([own, self.below.lit])
 
+    @property
+    def own_ground(self) -> np.ndarray:
+        """How far each row of the image has the ground's own factor, (rows,)."""
+        own = np.zeros(self.shape[0])
+        return own if self.below is None else np.concatenate([own, self.below.own_ground])
+
     def lighting(self, level: int) -> np.ndarray:
         """Return the share of the ground's irradiance that comes from the sky around each node, (nodes,).
 

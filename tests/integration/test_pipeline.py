@@ -198,10 +198,10 @@ def test_what_this_view_does_not_determine_changes_less(tmp_path):
     tables = {"target": target, "optimizer": {"iterations": 5}, "output": {"spp": 1024}}
     found = pipeline.run(plated(tmp_path, picture, **tables))
     assert not found.frozen.any() and len(found.separation.lights) == 1
-    x = latlong.directions(32, 64)[..., 0]
-    change = np.abs(np.log(found.envmap / found.maps["initial"])).max(axis=2)
+    x = latlong.directions(32, 64)[:16, :, 0]  # the ground follows what lights it on either side
+    change = np.abs(np.log(found.envmap / found.maps["initial"])).max(axis=2)[:16]
     assert change[x < -0.5].mean() < 0.9 * change[x > 0.5].mean()
-    known, x = found.posterior.identified[:16], x[:16]  # the ground follows what lights it on either side
+    known = found.posterior.identified[:16]
     assert known[x < -0.5].mean() < 0.8 * known[x > 0.5].mean()
     assert any("bit for bit" in line for line in found.metrics["choices"])
     assert found.metrics["render"]["psnr"] > found.metrics["initial"]["psnr"] + 8

@@ -83,7 +83,7 @@ def test_a_mirror_follows_a_factor_and_ground_fades(factor):
     assert (np.diff(found.mean(axis=(1, 2))) < 0).all()
 
 
-def test_ground_follows_the_glow_above_it_as_far_as_it_continues_the_sky(rng):
+def test_ground_follows_the_glow_above_it_as_far_as_it_continues_the_sky():
     """Walls go on below the horizon; a field of one colour never had the glow of the sun above it."""
     low, sky = halves(mirror(sun=(12, 20)))
     sunless = halves(mirror())[1]

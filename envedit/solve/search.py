@@ -23,7 +23,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from envedit.core.rotations import rotation_vector
-from envedit.representations.layers.lights import DARK
+from envedit.representations.layers.lights import DARK, log_flux_of
 from envedit.solve import gauss_newton, painted_places
 from envedit.solve.light_places import Places
 from envedit.solve.likelihood import INDEPENDENT, SIGMA
@@ -316,7 +316,7 @@ def _changes(problem, state, start, sigma):
             yield k, MOVED, moved, with_light(start, k, **centre), there.unlikeliness, cost
         # ---- softer: a light of few texels cannot grow, as its texels would part; a lobe can
         if own and spare:
-            flux = state["flux"][k] + np.log(lights.flux[k] / np.maximum(lights.flux[spare[0]], 1e-30))
+            flux = state["flux"][k] + log_flux_of(lights.flux[k] / lights.flux[spare[0]])
             turn = rotation_vector(lights.centres[spare[0]], away)
             size = lights.log_size(painted_places.LARGER_DEGREES[0])
             soft = with_light(dark, spare[0], turn=turn, flux=flux, size=size)

@@ -165,6 +165,19 @@ def test_a_sun_that_is_painted_under_a_sky_without_one_is_added_although_it_ligh
     assert off.max() > VISIBLE
 
 
+@pytest.mark.parametrize("channels", [(1, 1, 1), (1, 1, 0)], ids=["colours", "no blue"])
+@pytest.mark.filterwarnings("error")
+def test_a_shadow_painted_softer_makes_the_sun_larger(channels, transport):
+    image, softer = sky(SUN), sky()
+    near = (DIRECTIONS @ DIRECTIONS[SUN] > np.cos(np.radians(25)))[..., None]
+    sun = (image - softer)[SUN] * OMEGA[SUN[0]]
+    softer += sun * near / (near[..., 0] * OMEGA[:, None]).sum()
+    image, softer = (one * np.float32(channels) for one in (image, softer))
+    problem, start = problem_of(transport, image, *painted(transport, image, softer))
+    found, *_ = found_for(problem, start)
+    assert "light 1 softened" in [found.name, *(one.name for one in found.others)]
+
+
 # ---- lights stay -------------------------------------------------------------------------------------------
 
 

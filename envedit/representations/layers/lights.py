@@ -350,6 +350,11 @@ def flux_factor(log_flux: np.ndarray) -> np.ndarray:
     return np.where(log_flux <= DARK, 0, np.exp(np.minimum(log_flux, MOST_LOG_FLUX)))
 
 
+def log_flux_of(factor: ArrayLike) -> np.ndarray:
+    """Return the log flux of a factor, the inverse of :func:`flux_factor`; DARK of 0."""
+    return np.log(np.maximum(factor, np.exp(DARK)))
+
+
 def size_factor(log_size: ArrayLike) -> np.ndarray:
     """Return what a size is multiplied by; likewise."""
     return np.exp(np.clip(log_size, *LOG_SIZES))

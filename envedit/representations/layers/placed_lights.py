@@ -20,7 +20,7 @@ from envedit.core.rotations import rotation_vector
 from envedit.images import map_regions
 from envedit.representations.layers import below_horizon, light_images
 from envedit.representations.layers.layers import Layers
-from envedit.representations.layers.lights import DARK
+from envedit.representations.layers.lights import log_flux_of
 from envedit.representations.layers.unseen import unseen_kept
 
 ADDED_LEAST_TEXELS = 0.6
@@ -65,8 +65,7 @@ class PlacedLights:
             i = light.get("light", 0) - 1
             if not 0 <= i < len(self.lights):
                 continue
-            flux = np.maximum(flux_of(light), 1e-30)
-            values["flux"][i] = np.maximum(np.log(flux), DARK) / scales["flux"]
+            values["flux"][i] = log_flux_of(flux_of(light)) / scales["flux"]
             values["size"][i] = np.log(light["size"]) / scales["size"]
             if "azimuth" in light:
                 end = direction(light["azimuth"], light["elevation"])

@@ -261,13 +261,10 @@ class Preparation:
             if job.newton and not octaves:
                 job.layers.begun = run
 
-        # ---- Which texels keep their value: none for Gauss-Newton, whose prior holds what is not determined
-        frozen = None
-        if traced := self.renderer.transport:
-            frozen = np.zeros(original.shape[:2], bool)
-            if octaves or not job.newton:
-                frozen[rows] = ~traced.determined(rows, settings.renderer.influence_threshold)[rows]
-            job.free = ~frozen[rows] if frozen.any() else None
+        # ---- Which texels keep their value
+        frozen = self._frozen(determined=bool(octaves) or not job.newton)
+        if frozen is not None and frozen.any():
+            job.free = ~frozen[rows]
         if self.kept is not None and kind != "layers":  # which know it themselves
             open_texels = self.kept[rows] < map_regions.KEPT_SHARE
             job.free = open_texels if job.free is None else job.free & open_texels
@@ -282,6 +279,20 @@ class Preparation:
             job.representation = representation.refined(octaves)
             params = job.representation.start() | params
         return Edit(job, params, crop, degrees, frozen, notes)
+
+    def _frozen(self, determined: bool) -> np.ndarray | None:
+        """Return which texels keep their value, (H, W); None where no transport is stored.
+
+        Those that the picture does not determine; none for Gauss-Newton, whose prior holds them.
+        """
+        traced = self.renderer.transport
+        if not traced:
+            return None
+        rows = self.rows.slice
+        frozen = np.zeros(self.original.shape[:2], bool)
+        if determined:
+            frozen[rows] = ~traced.determined(rows, self.settings.renderer.influence_threshold)[rows]
+        return frozen
 
     def _encoded(self, crop: np.ndarray) -> tuple[Any, dict]:
         """Return the representation of a map's active rows, and parameters; a fit reports its progress."""

@@ -263,27 +263,30 @@ class Target(Table):
         return given or tuple(range(count))
 
     def _check_together(self) -> None:
-        if self.kind == "envmap" and isinstance(self.file, tuple):
-            raise ConfigError('target.file: got a list, expected one map, as target.kind is "envmap"')
-        if self.view != () and self.kind == "strokes":
-            raise ConfigError("target.view: got one, expected none: each stroke has a view of its own")
-        named = len(self.files) if self.kind in _PICTURES else len(self.masks)
-        if self.view != () and len(self.views) != named:
-            raise ConfigError(f"target.view: got {len(self.views)} views, expected {named}, one a file")
-        if len({*self.views}) != len(self.views):
-            raise ConfigError("target.view: got a view twice, expected each once")
-        if self.kind in _PICTURES and self.mask and len(self.masks) != named:
-            raise ConfigError(f"target.mask: got {len(self.masks)} masks, expected {named}, one a file")
+        self._check_files()
+        self._check_views()
         if self.kind == "envmap" and self.file and self.rotate_degrees not in ("auto", 0):
             raise ConfigError(
                 "target.file and target.rotate_degrees: got both, expected one: the other map, or the input "
                 'turned; remove one, or set rotate_degrees = "auto"'
             )
+        if self.kind in ("image", "strokes") and not self.paint and self.hold == 0:
+            raise ConfigError("target.paint, target.hold: got 0 for both, expected one above 0")
+        if self.kind == "strokes" and not self.strokes:
+            raise ConfigError('target.strokes: got none, expected at least one, as target.kind is "strokes"')
+        if self.kind != "strokes" and self.strokes:
+            raise ConfigError(
+                f'target.strokes: got {len(self.strokes)}, expected none, as target.kind is "{self.kind}": '
+                'set target.kind = "strokes"'
+            )
+
+    def _check_files(self) -> None:
+        """Raise ConfigError where a kind of target has files that it does not take, or lacks its own."""
+        if self.kind == "envmap" and isinstance(self.file, tuple):
+            raise ConfigError('target.file: got a list, expected one map, as target.kind is "envmap"')
         if self.kind in ("image", "photo") and not self.file:
             what = "painted image" if self.kind == "image" else "photograph"
             raise ConfigError(f'target.file: got "", expected the {what}, as target.kind is "{self.kind}"')
-        if self.kind == "strokes" and not self.strokes:
-            raise ConfigError('target.strokes: got none, expected at least one, as target.kind is "strokes"')
         if self.kind == "none" and (self.file or self.mask):
             raise ConfigError('target.file, target.mask: got one, expected none, as target.kind is "none"')
         if self.kind == "strokes" and self.file:
@@ -292,13 +295,18 @@ class Target(Table):
             )
         if self.kind == "strokes" and self.mask:
             raise ConfigError(f"target.mask: got {show(self.mask)}, expected none: strokes have a place")
-        if self.kind in ("image", "strokes") and not self.paint and self.hold == 0:
-            raise ConfigError("target.paint, target.hold: got 0 for both, expected one above 0")
-        if self.kind != "strokes" and self.strokes:
-            raise ConfigError(
-                f'target.strokes: got {len(self.strokes)}, expected none, as target.kind is "{self.kind}": '
-                'set target.kind = "strokes"'
-            )
+
+    def _check_views(self) -> None:
+        """Raise ConfigError where views do not match the files or masks, or are given twice."""
+        files = len(self.files) if self.kind in _PICTURES else len(self.masks)
+        if self.view != () and self.kind == "strokes":
+            raise ConfigError("target.view: got one, expected none: each stroke has a view of its own")
+        if self.view != () and len(self.views) != files:
+            raise ConfigError(f"target.view: got {len(self.views)} views, expected {files}, one a file")
+        if len({*self.views}) != len(self.views):
+            raise ConfigError("target.view: got a view twice, expected each once")
+        if self.kind in _PICTURES and self.mask and len(self.masks) != files:
+            raise ConfigError(f"target.mask: got {len(self.masks)} masks, expected {files}, one a file")
 
 
 def _each(files: str | tuple[str, ...]) -> tuple[str, ...]:

@@ -176,26 +176,7 @@ class StrokeList(Tables):
         for unknown in (k for k in stroke if k not in known):
             raise ConfigError(f"{name}, type {kind}, has no key {show(unknown)}; {meant(unknown, known)}")
 
-        found: dict[str, Any] = {"type": kind}
-        shapes = [shape for shape in SHAPES if shape in stroke]
-        if len(shapes) > 1:
-            raise ConfigError(f"{name}: got {' and '.join(shapes)}, expected one shape")
-        if not shapes and kind not in WHOLE_IMAGE:
-            raise ConfigError(f"{name}: got no shape, expected one of {', '.join(SHAPES)} for type {kind}")
-        for shape in shapes:
-            check, place, value = SHAPES[shape], f"{name}.{shape}", stroke[shape]
-            if isinstance(check, Points) and isinstance(value, list | tuple):
-                for i, point in enumerate(value):
-                    named(f"{place}[{i}]", _POINT, point)
-            found[shape] = named(place, check, value)
-        if "points" in stroke:
-            if "width" not in stroke:
-                raise ConfigError(
-                    f"{name}.width: got none, expected the width of the brush, as points are given"
-                )
-            found["width"] = named(f"{name}.width", _LENGTH, stroke["width"])
-        elif "width" in stroke:
-            raise ConfigError(f"{name}.width: got {show(stroke['width'])}, expected none without points")
+        found: dict[str, Any] = {"type": kind, **_shape_of(name, kind, stroke)}
         if "view" in stroke:
             found["view"] = named(f"{name}.view", View(), stroke["view"])
         for key, (default, check) in keys.items():
@@ -211,6 +192,29 @@ class StrokeList(Tables):
             properties[key] = each[0] if len(each) == 1 else {"anyOf": each}
             properties[key] = {**properties[key], "description": MEANINGS[key]}
         return self._schema_of({"properties": properties, "required": ["type"]})
+
+
+def _shape_of(name: str, kind: str, stroke: dict[str, Any]) -> dict[str, Any]:
+    """Return the shape of a stroke, and the width of its brush."""
+    found: dict[str, Any] = {}
+    shapes = [shape for shape in SHAPES if shape in stroke]
+    if len(shapes) > 1:
+        raise ConfigError(f"{name}: got {' and '.join(shapes)}, expected one shape")
+    if not shapes and kind not in WHOLE_IMAGE:
+        raise ConfigError(f"{name}: got no shape, expected one of {', '.join(SHAPES)} for type {kind}")
+    for shape in shapes:
+        check, place, value = SHAPES[shape], f"{name}.{shape}", stroke[shape]
+        if isinstance(check, Points) and isinstance(value, list | tuple):
+            for i, point in enumerate(value):
+                named(f"{place}[{i}]", _POINT, point)
+        found[shape] = named(place, check, value)
+
+    brush = "points" in stroke
+    if brush and "width" not in stroke:
+        raise ConfigError(f"{name}.width: got none, expected the width of the brush, as points are given")
+    if "width" in stroke and not brush:
+        raise ConfigError(f"{name}.width: got {show(stroke['width'])}, expected none without points")
+    return found | ({"width": named(f"{name}.width", _LENGTH, stroke["width"])} if brush else {})
 
 
 def stroke_keys() -> dict[str, list[Check]]:

@@ -63,18 +63,7 @@ def filled(envmap: np.ndarray, weight: np.ndarray) -> np.ndarray:
     if not ring.any():
         raise NothingAroundError
 
-    # ---- Filled in log radiance, channel by channel
-    image = np.empty(known.shape)
-    for c in range(3):
-        around = known[ring][:, c]
-        positive = around[around > 0]
-        floor = positive.min() if len(positive) else 1.0
-        low, high = np.log(floor), np.log(max(around.max(), floor))
-        scale = CODES / max(high - low, 1e-6)
-        codes = np.clip((np.log(np.maximum(known[..., c], floor)) - low) * scale, 0, CODES)
-        done = cv2.inpaint(np.float32(codes), unknown.astype(np.uint8), RADIUS, cv2.INPAINT_TELEA)
-        radiance = np.exp(low + np.clip(np.float64(done), 0, CODES) / scale)
-        image[..., c] = np.clip(radiance, around.min(), around.max())
+    image = _inpainted(cv2, known, unknown, ring)
 
     # ---- The region's texels of it
     result = envmap.copy()
@@ -93,6 +82,22 @@ def filled(envmap: np.ndarray, weight: np.ndarray) -> np.ndarray:
         old = envmap[first + rows, columns]
         result[first + rows, columns] = np.where(share == 1, filling, old + share * (filling - old))
     return result
+
+
+def _inpainted(cv2, known, unknown, ring):
+    """Fill unknown pixels of an image (n, n, 3) in log radiance, a channel at a time, in a ring's range."""
+    image = np.empty(known.shape)
+    for c in range(3):
+        around = known[ring][:, c]
+        positive = around[around > 0]
+        floor = positive.min() if len(positive) else 1.0
+        low, high = np.log(floor), np.log(max(around.max(), floor))
+        scale = CODES / max(high - low, 1e-6)
+        codes = np.clip((np.log(np.maximum(known[..., c], floor)) - low) * scale, 0, CODES)
+        done = cv2.inpaint(np.float32(codes), unknown.astype(np.uint8), RADIUS, cv2.INPAINT_TELEA)
+        radiance = np.exp(low + np.clip(np.float64(done), 0, CODES) / scale)
+        image[..., c] = np.clip(radiance, around.min(), around.max())
+    return image
 
 
 def _opencv():

@@ -37,39 +37,39 @@ def _jpeg_header(name, info):
     marks = info["marks"]
     size = None
     mean = 0.0
-    with open(name, "rb") as file:
-        file.seek(2)
-        while True:
-            marker = file.read(4)
-            if len(marker) < 4 or marker[0] != 0xFF:
+    for marker, data in _jpeg_segments(name):
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC) and size is None:
+            if len(data) < 6:
                 break
-            if marker[1] == 0xFF:  # padding before a marker
-                file.seek(-3, os.SEEK_CUR)
-                continue
-            if marker[1] == 0xDA:  # the picture begins
-                break
-            data = file.read(max(int.from_bytes(marker[2:], "big") - 2, 0))
-            if 0xC0 <= marker[1] <= 0xCF and marker[1] not in (0xC4, 0xC8, 0xCC) and size is None:
-                if len(data) < 6:
-                    break
-                size = int.from_bytes(data[3:5], "big"), int.from_bytes(data[1:3], "big")
-                if data[5] not in (1, 3):
-                    raise InputError(f"{name}: holds {data[5]} channels (CMYK?); save it as RGB")
-            elif marker[1] == 0xDB and not mean and data and not data[0] & 15:
-                wide = 2 if data[0] >> 4 else 1
-                if len(data) <= 64 * wide:
-                    raise damaged(name, "a quantisation table breaks off")
-                mean = float(np.frombuffer(data[1 : 1 + 64 * wide], f">u{wide}").mean())
-            elif marker[1] == 0xE1 and data[:6] == b"Exif\0\0":
-                marks["orientation"] = _orientation(data[6:])
-            elif marker[1] == 0xE2 and data[:12] == b"ICC_PROFILE\0":
-                marks["profile"] = marks.get("profile", b"") + data[14:]
+            size = int.from_bytes(data[3:5], "big"), int.from_bytes(data[1:3], "big")
+            if data[5] not in (1, 3):
+                raise InputError(f"{name}: holds {data[5]} channels (CMYK?); save it as RGB")
+        elif marker == 0xDB and not mean and data and not data[0] & 15:
+            wide = 2 if data[0] >> 4 else 1
+            if len(data) <= 64 * wide:
+                raise damaged(name, "a quantisation table breaks off")
+            mean = float(np.frombuffer(data[1 : 1 + 64 * wide], f">u{wide}").mean())
+        elif marker == 0xE1 and data[:6] == b"Exif\0\0":
+            marks["orientation"] = _orientation(data[6:])
+        elif marker == 0xE2 and data[:12] == b"ICC_PROFILE\0":
+            marks["profile"] = marks.get("profile", b"") + data[14:]
     if size is None:
         raise damaged(name, "no JPEG frame header")
     scale = mean / _JPEG_MEAN
     quality = round(100 - 50 * scale if scale < 1 else 50 / scale)
     info["quality"] = min(max(quality, 1), 100)
     return size
+
+
+def _jpeg_segments(name):
+    """Yield marker, int, and data of each segment of a JPEG file, until the picture begins."""
+    with open(name, "rb") as file:
+        file.seek(2)
+        while len(start := file.read(4)) == 4 and start[0] == 0xFF and start[1] != 0xDA:
+            if start[1] == 0xFF:  # padding before a marker
+                file.seek(-3, os.SEEK_CUR)
+                continue
+            yield start[1], file.read(max(int.from_bytes(start[2:], "big") - 2, 0))
 
 
 _JPEG_MEAN = 3688 / 64

@@ -109,17 +109,7 @@ def read(
     excluded = uncertain | (alpha == 0)
     if before is not None:
         excluded = uncertain & ((coverage > 0) | (before >= 1 - 0.5 / top).any(axis=2))
-    uncounted = excluded & (coverage > 0)
-    if uncounted.any() and (excluded | (coverage == 0)).all():
-        raise InputError(
-            f"{file}: all that is painted is clipped, and says only 'at least so bright': "
-            'paint below white, or on an .exr, or under [target] tonemap = "reinhard"'
-        )
-    if uncounted.any() and before is not None:
-        warnings.append(
-            f"{file}: {uncounted.sum()} painted pixels are clipped ('at least so bright') and left out; to "
-            "have them count, paint below white, or on an .exr"
-        )
+    warnings += _clipped_paint(file, excluded, coverage, before is None)
 
     # ---- The picture, in linear radiance
     picture = values if info["hdr"] else inverse_tonemap(values, name)
@@ -127,6 +117,27 @@ def read(
         picture = np.where((painted & (coverage > 0))[..., None], picture, initial)
     picture = np.minimum(picture, np.finfo(np.float32).max).astype(np.float32)
     return Painted(picture, coverage[..., None].astype(np.float32), excluded, clipped, tuple(warnings))
+
+
+def _clipped_paint(file, excluded, coverage, whole):
+    """Return a warning of painted pixels that are clipped; InputError where there are no others.
+
+    Of a ``whole`` picture, painted everywhere, nothing is said.
+    """
+    uncounted = excluded & (coverage > 0)
+    if not uncounted.any():
+        return []
+    if (excluded | (coverage == 0)).all():
+        raise InputError(
+            f"{file}: all that is painted is clipped, and says only 'at least so bright': "
+            'paint below white, or on an .exr, or under [target] tonemap = "reinhard"'
+        )
+    if whole:
+        return []
+    return [
+        f"{file}: {uncounted.sum()} painted pixels are clipped ('at least so bright') and left out; to "
+        "have them count, paint below white, or on an .exr"
+    ]
 
 
 def given(picture: np.ndarray, shape: Shape, initial: np.ndarray, mask: np.ndarray | None = None) -> Painted:

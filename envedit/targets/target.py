@@ -156,7 +156,13 @@ def _made(settings, scene, envmap, picture, mask, other, hidden):
             )
         return _of_rendering(settings, scene, envmap, picture, mask)
 
-    # ---- What was painted
+    return _of_paint(settings, scene, envmap, picture, mask, hidden)
+
+
+def _of_paint(settings, scene, envmap, picture, mask, hidden):
+    """Take what was painted on the initial rendering; a picture that was rendered anew is one of a scene."""
+    # ---- The picture
+    chosen = settings.target
     initial = initial_rendering.initial(scene, envmap, settings)
     asked: tuple[np.ndarray, ...] = ()
     if picture is not None:
@@ -171,13 +177,11 @@ def _made(settings, scene, envmap, picture, mask, other, hidden):
         source = f"painted: {len(chosen.strokes)} strokes on the initial rendering"
     if chosen.kind == "image" and mask is None and not chosen.masks:
 
-        def rendered_again():
-            spp, seed, cache = chosen.spp, Seeds.of(settings.seed).judged, settings.renderer.cache
-            return rendered(scene, envmap, spp, seed, cache)[0]
+        def again():
+            seed, cache = Seeds.of(settings.seed).judged, settings.renderer.cache
+            return rendered(scene, envmap, chosen.spp, seed, cache)[0]
 
-        if rendered_anew.is_rendered_anew(
-            painted.picture, initial, painted.coverage, rendered_again, scene.rows
-        ):
+        if rendered_anew.is_rendered_anew(painted.picture, initial, painted.coverage, again, scene.rows):
             return _of_rendering(settings, scene, envmap, picture, mask, FOUND_ANEW)
     picture, warnings = painted.picture, painted.warnings
     if over := int((picture > BRIGHTEST).any(axis=2).sum()):

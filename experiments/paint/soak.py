@@ -13,9 +13,6 @@ from experiments.harness import Experiment, calling, done_of, figure
 from experiments.paint.figure10 import RENDERED, drag, opened, place, prepared
 
 MEMORY_EVERY_S = 1.0
-ACTIONS = (
-    ["stroke"] * 6 + ["light"] * 3 + ["region", "undo", "redo", "button", "turn", "wheel", "key", "reload"]
-)
 BUTTONS = ("add-light", "light-mute", "light-delete", "region-remove", "clear", "shape-polygon")
 KEYS = ("b", "1", "5", "[", "]", "Escape", "Enter", "Control+z", "ArrowLeft")
 MOVE_S = 0.03
@@ -41,44 +38,84 @@ def resident_mb(process) -> float:
 def act(page, chance: random.Random) -> str:
     """Do something at random; returns what."""
     what = chance.choice(ACTIONS)
-    spot = lambda name: place(page, name, chance.random(), chance.random())  # noqa: E731
-    if what == "stroke":
-        for name in ("[data-tool]", "[data-shape]:visible"):
-            buttons = page.locator(name)
-            if buttons.count():
-                buttons.nth(chance.randrange(buttons.count())).click()
-        drag(page, [spot("#overlay") for _ in range(chance.randrange(2, 12))], MOVE_S)
-    elif what == "light":
-        seen = page.evaluate(SEEN_HANDLES)  # the map may be zoomed
-        if seen:
-            spots = [spot("#map-stack") for _ in range(chance.randrange(1, 12))]
-            drag(page, [chance.choice(seen), *spots], MOVE_S)
-    elif what == "region":
-        page.get_by_test_id("region").click()
-        kind = page.get_by_test_id("region-action")
-        if kind.is_visible():
-            kind.select_option(chance.choice(["keep", "scale", "fill"]))
-            drag(page, [spot("#map-stack") for _ in range(chance.randrange(2, 6))], MOVE_S)
-    elif what in ("undo", "redo"):
-        page.get_by_test_id(what).click(force=True)
-    elif what == "button":
-        button = page.get_by_test_id(chance.choice(BUTTONS))
-        if button.is_visible() and button.is_enabled():
-            button.click()
-    elif what == "turn":
-        page.get_by_test_id("degrees").fill(str(chance.randrange(-400, 400)))
-        page.keyboard.press("Enter")
-    elif what == "wheel":
-        page.mouse.move(*spot("#map-stack"))
-        page.mouse.wheel(0, chance.choice([-100, 100]))
-    elif what == "key":
-        page.keyboard.press(chance.choice(KEYS))
-    else:
-        page.reload()
-        page.wait_for_selector("#work:not([hidden])", timeout=120_000)
-        page.wait_for_selector(".handle", state="attached", timeout=120_000)
+    what(page, chance)
     time.sleep(LONGEST_PAUSE_S * chance.random())
-    return what
+    return what.__name__
+
+
+def stroke(page, chance):
+    """Paint with any tool and shape."""
+    for name in ("[data-tool]", "[data-shape]:visible"):
+        buttons = page.locator(name)
+        if buttons.count():
+            buttons.nth(chance.randrange(buttons.count())).click()
+    drag(page, spots(page, chance, "#overlay", chance.randrange(2, 12)), MOVE_S)
+
+
+def light(page, chance):
+    """Drag a light."""
+    seen = page.evaluate(SEEN_HANDLES)  # the map may be zoomed
+    if seen:
+        there = spots(page, chance, "#map-stack", chance.randrange(1, 12))
+        drag(page, [chance.choice(seen), *there], MOVE_S)
+
+
+def region(page, chance):
+    """Draw a region of the map."""
+    page.get_by_test_id("region").click()
+    kind = page.get_by_test_id("region-action")
+    if kind.is_visible():
+        kind.select_option(chance.choice(["keep", "scale", "fill"]))
+        drag(page, spots(page, chance, "#map-stack", chance.randrange(2, 6)), MOVE_S)
+
+
+def undo(page, chance):
+    """Take something back."""
+    page.get_by_test_id("undo").click(force=True)
+
+
+def redo(page, chance):
+    """Do it again."""
+    page.get_by_test_id("redo").click(force=True)
+
+
+def button(page, chance):
+    """Press a button that can be pressed."""
+    pressed = page.get_by_test_id(chance.choice(BUTTONS))
+    if pressed.is_visible() and pressed.is_enabled():
+        pressed.click()
+
+
+def turn(page, chance):
+    """Turn the sky."""
+    page.get_by_test_id("degrees").fill(str(chance.randrange(-400, 400)))
+    page.keyboard.press("Enter")
+
+
+def wheel(page, chance):
+    """Zoom into the map, or out of it."""
+    page.mouse.move(*spots(page, chance, "#map-stack", 1)[0])
+    page.mouse.wheel(0, chance.choice([-100, 100]))
+
+
+def key(page, chance):
+    """Press a key."""
+    page.keyboard.press(chance.choice(KEYS))
+
+
+def reload(page, chance):
+    """Open the page again."""
+    page.reload()
+    page.wait_for_selector("#work:not([hidden])", timeout=120_000)
+    page.wait_for_selector(".handle", state="attached", timeout=120_000)
+
+
+ACTIONS = [stroke] * 6 + [light] * 3 + [region, undo, redo, button, turn, wheel, key, reload]
+
+
+def spots(page, chance, name, count) -> list:
+    """Return places at random in an element of the page."""
+    return [place(page, name, chance.random(), chance.random()) for _ in range(count)]
 
 
 def at_rest_mb(page, process) -> float:

@@ -93,16 +93,25 @@ class Session:
     """A painting that is open; ``tell`` receives frames and progress, ``newer`` asks if an edit waits."""
 
     def __init__(self, project: Project, tell: Tell, newer: Callable[[], bool] = lambda: False):
-        self.project, self.tell = project, tell
-        self._saving = self._dragged = False
-        self.newer = lambda: not self._saving and newer()
+        # ---- What is edited, and what has come of it
+        self.project = project
+        self.tell = tell
+        self.document = Document()
+        self.resting = False
+        self.phase = "done"
+        self.status: dict[str, Any] = {"iterations": 0, "steps": 0, "number": 0, "client": ""}
         self.reach: feasibility.Reach | None = None  # of what is painted, once it is known
         self._kept = project.document  # as painted.toml has it
+        self._saving: bool = False
+        self._dragged = False
+        self.newer = lambda: not self._saving and newer()
         self._memory_due = 0.0  # when freed buffers are given back while work goes on
-        self.document, self.resting, self.phase = Document(), False, "done"
         self._rendered: tuple[int, Any] | None = None  # passes and their sum
         self._shown: np.ndarray | None = None  # the rendering by T that the pages show
-        self.status: dict[str, Any] = {"iterations": 0, "steps": 0, "number": 0, "client": ""}
+        self._sharp: Scene | None = None
+        self._wide: inputs.InputMap | None = None  # the map as it is shown large
+
+        # ---- Scene and map
         settings = project.settings
         if project.photo:
             self._match(project.photo)
@@ -112,32 +121,40 @@ class Session:
         self.given = inputs.read_map(settings.input, self.scene, settings.input.width)
         self.notes = self.given.warnings
         source = Path(settings.input.envmap)
-        self.photograph = None  # in the scene's radiance
-        if source.name == MATCHED:
-            self.photograph = images.read(source.with_name("render_target.exr"))[0]
+        matched = source.name == MATCHED
+        # In the scene's radiance
+        self.photograph = images.read(source.with_name("render_target.exr"))[0] if matched else None
         self.map = self.given.radiance
-        height = len(self.map)
-        self.rows = inputs.active_rows(settings.input.rows, height)
+        self.rows = inputs.active_rows(settings.input.rows, len(self.map))
+
+        # ---- Light transport, and one of fewer samples while a pointer moves
         renderers.check(settings, self.scene, self.map.shape[:2])
         self._stage("tracing light transport")
         self.transport = renderers.trace(settings, self.scene, self.map.shape[:2], self._progress)
+        self._quick = self._of_fewer_samples()
+        self._recorded = self._quick is self.transport
+        self._watched: Any = _Watched(self.transport, self.newer)  # a transport in all it does
+
+        # ---- Lights, and the rendering as it is
         self._stage("separating lights")
         self.placed = PlacedLights(self.map, settings.input.horizon)
         self.picking = picking.Picking(self.scene, self.placed, self.transport, self.rows)
-        self._watched: Any = _Watched(self.transport, self.newer)  # a transport in all it does
-        self._quick = self.transport
-        if self.transport.spp > QUICK_SPP:
-            fewer = replace(settings, renderer=replace(settings.renderer, spp=QUICK_SPP))
-            self._quick = renderers.trace(fewer, self.scene, self.map.shape[:2], self._progress)
-        self._sharp: Scene | None = None
-        self._wide: inputs.InputMap | None = None  # the map as it is shown large
-        self._recorded = self._quick is self.transport
         self.transport.resolve(self.map, limit=COLUMNS)
         self.before = self.transport.apply(tensor(self.map)).numpy()
+
+        # ---- What solves for an edit
         self.solution = Solution(settings, self.scene, self.placed, self.transport, self.rows)
         self._aim(self._usable(project.document))
         if project.start and self.solving:
             self._go_on_from(project.start)
+
+    def _of_fewer_samples(self):
+        """Return a transport of at most :data:`QUICK_SPP` samples a pixel."""
+        settings = self.project.settings
+        if self.transport.spp <= QUICK_SPP:
+            return self.transport
+        fewer = replace(settings, renderer=replace(settings.renderer, spp=QUICK_SPP))
+        return renderers.trace(fewer, self.scene, self.map.shape[:2], self._progress)
 
     def _usable(self, document):
         """Return a document without the strokes on views that the scene has not, each with a note."""

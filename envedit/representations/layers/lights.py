@@ -98,34 +98,28 @@ class Lights:
         aureoles: bool | np.ndarray = True,
         background: np.ndarray | None = None,
     ):
-        first, total = rows
         self.own = len(lights)
         self.count = len(lights) + SPARE
         self.width = width
-        self.total = total
+        self.total = rows[1]
         self._rows = rows
 
         # ---- Points of each light: directions, fluxes, and widths as the sine of a polar angle
-        directions, fluxes, sines = [], [], []
-        omega = latlong.lookup_solid_angles(total, width)
-        for light in lights:
-            row, column = first + light.texels // width, light.texels % width
-            directions.append(points(row, column, total, width))
-            fluxes.append(light.radiance * omega[row][:, None])
-            sines.append(np.sin(np.pi * row / max(total - 1, 1)))
+        directions, fluxes, sines = _points_of(lights, rows, width)
         own = np.array([flux.sum(axis=0) for flux in fluxes]).reshape(-1, 3)
-        spare = own.mean(axis=0) if len(own) else np.ones(3)
-        spare = np.maximum(spare, FAINTEST * spare.max())
+
+        # ---- Those of spare ones
         sky = None if background is None else Sky.of(background, rows)
         strongest = _strongest([light.glow for light in lights], own)
         clear = sky is not None and strongest is None and sky.irradiance > LEAST_IRRADIANCE
+        spare = own.mean(axis=0) if len(own) else np.ones(3)
+        spare = np.maximum(spare, FAINTEST * spare.max())
         if clear:
             spare *= CLEAR_FLUX * sky.irradiance / (spare @ LUMINANCE)
-        for _ in range(SPARE):
-            d, weight, spacing = lobe()
-            directions.append(d)
-            fluxes.append(weight[:, None] * spare)
-            sines.append(np.full(len(d), spacing / (2 * math.pi / width)))
+        d, weight, spacing = lobe()
+        directions += [d] * SPARE
+        fluxes += [weight[:, None] * spare] * SPARE
+        sines += [np.full(len(d), spacing / (2 * math.pi / width))] * SPARE
 
         # ---- Which light each point is of
         counts = [len(d) for d in directions]
@@ -145,20 +139,20 @@ class Lights:
         self._centre = dr.opaque(mi.Vector3f(self.centres.T.astype(np.float32)))
 
         # ---- Glows
-        self.glows = [light.glow for light in lights]
-        added = aureoles if isinstance(aureoles, np.ndarray) else None
-        if aureoles is True:
-            added = clear_glow() if clear else None
-            if strongest is not None:
-                own_flux = np.maximum(own[strongest], FAINTEST * own[strongest].max())
-                added = self.glows[strongest] * (spare / own_flux)
+        of_spare = aureoles if isinstance(aureoles, np.ndarray) else None
+        if aureoles is True and strongest is not None:
+            own_flux = np.maximum(own[strongest], FAINTEST * own[strongest].max())
+            of_spare = lights[strongest].glow * (spare / own_flux)
+        elif aureoles is True and clear:
+            of_spare = clear_glow()
+        own_glows = [light.glow for light in lights]
+        self.glows = own_glows + [of_spare] * SPARE
         self._aureoles = [
-            None if glow is None else Aureole(glow, home, sky)
-            for glow, home in zip(self.glows, self.centres, strict=False)
+            None if glow is None else Aureole(glow, centre, sky)
+            for glow, centre in zip(own_glows, self.centres, strict=False)
         ]
         home = None if strongest is None else self.centres[strongest]
-        self.glows += [added] * SPARE
-        self._aureoles += [None if added is None else Aureole(added, home, sky)] * SPARE
+        self._aureoles += [None if of_spare is None else Aureole(of_spare, home, sky)] * SPARE
 
     @property
     def glowing(self) -> bool:
@@ -333,6 +327,19 @@ def lobe() -> tuple[np.ndarray, np.ndarray, float]:
 def _widths(wide, added):
     """Return widths of points in columns at the equator: those of a round lobe are a texel wide at least."""
     return dr.select(added, dr.maximum(wide, dr.minimum(wide * (SPACINGS / NARROWEST), 1)), wide)
+
+
+def _points_of(lights, rows, width):
+    """List directions (n, 3), fluxes (n, 3) and sines of polar angles (n,) of the texels of each light."""
+    first, total = rows
+    directions, fluxes, sines = [], [], []
+    omega = latlong.lookup_solid_angles(total, width)
+    for light in lights:
+        row, column = first + light.texels // width, light.texels % width
+        directions.append(points(row, column, total, width))
+        fluxes.append(light.radiance * omega[row][:, None])
+        sines.append(np.sin(np.pi * row / max(total - 1, 1)))
+    return directions, fluxes, sines
 
 
 def _strongest(glows, fluxes):

@@ -26,9 +26,10 @@ from envedit.core.types import Params
 from envedit.images import map_regions
 from envedit.losses.perceptual import distances
 from envedit.representations.layers import below_horizon
+from envedit.representations.siren.siren import Siren
 from envedit.scene.renderings import rendered
 from envedit.scene.scene import Scene
-from envedit.solve import adam_loop, adam_solver, initialization, turning
+from envedit.solve import adam_loop, adam_solver, initialization, sky_factor, turning
 from envedit.solve.edit_state import EditState, Watch
 from envedit.solve.layers_solver import LayersSolver
 from envedit.solve.likelihood import INDEPENDENT
@@ -269,6 +270,10 @@ class Preparation:
             open_texels = self.kept[rows] < map_regions.KEPT_SHARE
             job.free = open_texels if job.free is None else job.free & open_texels
 
+        # ---- How bright the sky of a network begins
+        if isinstance(representation, Siren):
+            notes += self._brightened(representation, original, job.free, target)
+
         # ---- Finer grids
         if recordings:
             representation = representation.keeping(job.free)
@@ -293,6 +298,20 @@ class Preparation:
         if determined:
             frozen[rows] = ~traced.determined(rows, self.settings.renderer.influence_threshold)[rows]
         return frozen
+
+    def _brightened(self, network, original, free, target):
+        """Set the factor of a network's sky; returns notes. What was not painted is to stay, and has none."""
+        transport = self.renderer.transport
+        if transport is None or target.coverage is not None or target.photo is not None:
+            return []
+        active = np.zeros(original.shape[:2], bool)
+        active[self.rows.slice] = True if free is None else free
+        with self.clock("start_s"):
+            network.factor = sky_factor.find(transport, original, active, target.picture, target.known_weight)
+        if (network.factor == 1).all():
+            return []
+        factors = ", ".join(f"{factor:.3g}" for factor in network.factor)
+        return [f"the sky begins {factors} (red, green, blue) times as bright"]
 
     def _encoded(self, crop: np.ndarray) -> tuple[Any, dict]:
         """Return the representation of a map's active rows, and parameters; a fit reports its progress."""

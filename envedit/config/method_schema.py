@@ -98,7 +98,7 @@ class Loss(Table):
     luminance: Ramp = key(0.0, Weight(), "change of the map's summed luminance (Eq. 8)")
     l1: Ramp = key(0.0, Weight(), "sum of the map's radiance (Eq. 9)")
     dists: Ramp | str = key(
-        0.0, OrAuto(Weight()), "DISTS of map and original; auto: 0.3 for a SIREN where weights are, else 0"
+        0.0, OrAuto(Weight()), "DISTS of map and original; auto: 0.1 for a SIREN where weights are, else 0"
     )
     tv: Ramp = key(0.0, Weight(), "total variation of the map")
     change: Ramp = key(0.0, Weight(), "mean change of the map's logarithm: what need not change stays")

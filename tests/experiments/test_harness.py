@@ -174,7 +174,7 @@ COUNTS = {
     "paint.soak": 1,
     "painted_edits": 18,
     "painted_edits.artists": 296,
-    "paper": 684,
+    "paper": 720,
     "photograph": 396,
     "pictures": 30,
     "scenes": 6,

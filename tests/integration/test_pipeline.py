@@ -419,8 +419,24 @@ def test_a_siren_says_how_to_get_weights_and_has_dists_where_they_are(tmp_path, 
     (tmp_path / "weights").mkdir()
     there = {"perceptual": {"weights": str(tmp_path / "weights")}}
     found = pipeline.run(settings_of(tmp_path, sunny(rng), **few, **there))
-    assert found.settings.loss.dists == 0.3 and found.history[-1]["dists"] > 0
+    assert found.settings.loss.dists == 0.1 and found.history[-1]["dists"] > 0
     assert found.settings.optimizer.iterations == 2 and not any("DISTS" in line for line in found.notes)
+
+
+@pytest.mark.slow
+def test_a_siren_reaches_a_sky_brighter_than_any_texel_of_the_map(tmp_path, rng):
+    """Its output is between the map's darkest and brightest: the sky begins with a factor."""
+    picture = 0.1 * smooth(rng)
+    active = slice(0, HEIGHT // 2)
+    brighter = picture.copy()
+    brighter[active] *= 4
+    images.write_exr(tmp_path / "brighter.exr", brighter)
+    few = {"representation": {"kind": "siren", "hidden": 32, "depth": 1}, "fit": {"epochs": 200}}
+    wanted = {"target": {"file": "brighter.exr"}, "optimizer": {"iterations": 20}}
+    found = pipeline.run(settings_of(tmp_path, picture, **few, **wanted))
+    assert any("the sky begins" in line for line in found.notes)
+    assert found.envmap[active].mean() / picture[active].mean() == pytest.approx(4, rel=0.1)
+    assert found.metrics["render"]["psnr"] > found.metrics["initial"]["psnr"] + 10
 
 
 def test_the_folder_that_a_configuration_names_must_hold_the_weights(tmp_path, rng):

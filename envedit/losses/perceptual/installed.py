@@ -19,8 +19,9 @@ BACKBONES = {"alex": "alexnet_features.npz", "vgg": VGG, "squeeze": "squeezenet_
 HEADS = "lpips_v0.1_{}.npz"
 """Names of the files in a folder of weights."""
 
-DISTS_WEIGHT = 0.3
-"""``loss.dists`` of a SIREN at "auto", where weights are; 0 elsewhere."""
+DISTS_WEIGHT = 0.1
+"""``loss.dists`` of a SIREN at "auto", where weights are; 0 elsewhere. Measured, with the steps:
+docs/decisions/edit_of_the_network.md."""
 STEPS_WITH_DISTS = 300
 """``optimizer.iterations`` at "auto" with DISTS; without it, as for other maps of many parameters."""
 

@@ -19,7 +19,9 @@ class Siren:
     """The weights of a SIREN fitted to the image (Eq. 1-3); robust (R-SIREN) when fitted with awp_gamma > 0.
 
     ``rows`` says which rows of a map the images are: (first row, rows of the whole map); None: all of it.
-    ``fitted`` says, after :meth:`encode`, how well the network reproduces the image.
+    ``fitted`` says, after :meth:`encode`, how well the network reproduces the image. Its radiance is between
+    the image's darkest and brightest; ``factor`` (3,) of each channel is what decoded radiance is multiplied
+    by.
     """
 
     lr = 5e-5
@@ -38,6 +40,7 @@ class Siren:
         self.folder = folder
         self.progress = progress
         self.fitted: fit.Fitted | None = None
+        self.factor = np.ones(3)
         self._rows = rows
         self._shape: tuple[int, int] | None = None
         self._points: dict[tuple[int, int], mi.TensorXf] = {}
@@ -63,4 +66,5 @@ class Siren:
             rows = above, above + shape[0] + below
             self._points[shape] = fit.points(self.network, shape, rows)
         normalisation = self.fitted.normalisation
-        return fit.evaluate(params, normalisation, self._points[shape], shape, self.network.omega)
+        radiance = fit.evaluate(params, normalisation, self._points[shape], shape, self.network.omega)
+        return radiance * tensor(self.factor[None, None])

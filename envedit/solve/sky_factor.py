@@ -33,7 +33,8 @@ def find(
     (:data:`.likelihood.INDEPENDENT`, at most one a pixel), it needs N ln(m_1 / m) > 2 ln(number of factors).
     No texel becomes brighter than :data:`.radiance.BRIGHTEST`.
     """
-    # ---- What these texels give the rendering, and all else
+    # ---- What these texels give the rendering, and all else: a sun by exact columns
+    transport.resolve(envmap)
     others = np.where(active[..., None], 0, envmap).astype(np.float32)
     still = transport.apply(mi.TensorXf(others)).numpy()
     lit = transport.apply(mi.TensorXf(envmap)).numpy() - still

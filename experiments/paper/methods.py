@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from envedit.losses.perceptual.installed import DISTS_WEIGHT
+
 PRESETS = {"paper": "paper", "ours": "standard"}
 """Preset of either settings."""
 
@@ -59,7 +61,12 @@ METHODS = {
     "r-siren": _siren("R-SIREN HDR", False, awp_gamma=0.01),
     "r-siren-reg": _siren("R-SIREN HDR + L_reg", True, awp_gamma=0.01),
     "r-siren-own": Method(
-        "R-SIREN HDR, our losses", {"representation": {"kind": "siren"}, "fit": {"awp_gamma": 0.01}}
+        "R-SIREN HDR, our losses",
+        {
+            "representation": {"kind": "siren"},
+            "fit": {"awp_gamma": 0.01},
+            "loss": {"dists": DISTS_WEIGHT},
+        },
     ),
     "layers": _plain("Layers (ours)", "layers"),
 }

@@ -580,7 +580,7 @@ def test_overview_on_disk_has_the_same_bits(lamp_scene, tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_another_seed_needs_no_other_kernel(lamp_scene):
     # Else every refresh, and every run of a series, would pay seconds of compilation.
-    build(lamp_scene, spp=32, seed=11).resolve(sun(7, 9))
+    compiled(lambda: build(lamp_scene, spp=32, seed=11).resolve(sun(7, 9)))
     count, fresh = compiled(lambda: build(lamp_scene, spp=32, seed=12).resolve(sun(3, 20)))
     # Where no path of a batch is kept, what it left unevaluated may join a later kernel: one in a hundred.
     assert count > 50 and fresh <= 0.05 * count

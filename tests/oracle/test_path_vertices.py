@@ -202,7 +202,7 @@ def test_paths_of_some_blocks_are_not_kept_for_those_of_all(air, monkeypatch):
 def test_no_number_of_vertices_needs_its_own_kernels(name, monkeypatch):
     monkeypatch.setattr(path_vertices, "LANES", 200 * COUNT)  # two blocks of 200 pixels and one of 176
     columns = columns_of(load(name))
-    columns.trace(TEXELS[1:2], COUNT, SEED, blocks=1)
+    compiled(lambda: columns.trace(TEXELS[1:2], COUNT, SEED, blocks=1))
     for texels, seed in ((TEXELS[1:2], SEED), (TEXELS, SEED + 1), (TEXELS[3:5], SEED + 1)):
         launched, fresh = compiled(lambda t=texels, s=seed: columns.trace(t, COUNT, s))
         assert launched > 10 and fresh == 0

@@ -44,7 +44,14 @@ def find(
     most = max(BRIGHTEST / brightest, 1.0) if brightest > 0 else np.inf
     factors = 2.0**STOPS
     factors = factors[factors <= most]
-    misfits = np.array([_misfit(still + np.float32(factor) * lit, picture, weight) for factor in factors])
+    wanted = turning.display_values(picture)
+    counted = 1.0 if weight is None else weight
+
+    def misfit(factor):
+        seen = turning.display_values(still + np.float32(factor) * lit)
+        return (np.square(seen - wanted) * counted).mean(axis=(0, 1))
+
+    misfits = np.array([misfit(factor) for factor in factors])
     misfits = np.where(np.isfinite(misfits), misfits, np.inf)
 
     # ---- The best, where it is likelier than none
@@ -55,8 +62,3 @@ def find(
     cost = 2 * np.log(len(factors)) / independent
     likelier = least * np.exp(cost) < unchanged
     return np.where(likelier, factors[best], 1.0)
-
-
-def _misfit(rendering, picture, weight):
-    squared = np.square(turning.residuals(rendering, picture))
-    return (squared if weight is None else squared * weight).mean(axis=(0, 1))

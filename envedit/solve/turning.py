@@ -113,8 +113,8 @@ def _fraction(render, maps, picture, weight):
     Between them the map is linear in the fraction f: d(t) = d(a) + f (d(b) - d(a)). Both are rendered twice,
     as in a product of differences with independent noise that noise is no bias.
     """
-    (a1, b1), (a2, b2) = ([_shown(render(envmap, k)) for envmap in maps] for k in (0, 1))
-    target, count = _shown(picture), 1.0 if weight is None else weight
+    (a1, b1), (a2, b2) = ([display_values(render(envmap, k)) for envmap in maps] for k in (0, 1))
+    target, count = display_values(picture), 1.0 if weight is None else weight
     lengths = count * (b1 - a1) * (b2 - a2)
     towards = count * ((target - a1) * (b2 - a2) + (target - a2) * (b1 - a1)) / 2
     if not lengths.sum() > 0:
@@ -137,11 +137,12 @@ def apart(rendering: np.ndarray, picture: np.ndarray, weight: np.ndarray | None 
 
 def residuals(rendering: np.ndarray, picture: np.ndarray) -> np.ndarray:
     """Return display values of a rendering less those of a picture, (h, w, 3) float64 both."""
-    return _shown(rendering) - _shown(picture)
+    return display_values(rendering) - display_values(picture)
 
 
-def _shown(picture):
-    return np.float64(display_curve.to_display(tensor(picture)).numpy())
+def display_values(picture: np.ndarray) -> np.ndarray:
+    """Return display values of a picture (h, w, 3), linear radiance, as float64."""
+    return display_curve.to_display(tensor(picture)).numpy().astype(np.float64)
 
 
 def _at_a_glance(transport, envmap, picture, weight, rendering):

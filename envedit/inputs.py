@@ -264,10 +264,10 @@ def load_map(settings: config.Input, scene: Scene | None = None) -> tuple[np.nda
     return input_map.radiance, input_map.warnings
 
 
-def notes(settings: config.Input, scene: Scene, input_map: InputMap | None = None) -> list[str]:
+def notes(settings: config.Input, scene: Scene, input_map: InputMap) -> list[str]:
     """Say which map a run took and what the scene's file has that is used otherwise."""
     own = scene.own
-    source = source_of(settings, scene) if input_map is None else input_map.source
+    source = input_map.source
     first = []
     last = []
     if source == SCENE and own.light is not None:
@@ -283,9 +283,9 @@ def notes(settings: config.Input, scene: Scene, input_map: InputMap | None = Non
             f"the scene multiplies the map (which is not the scene's own) by scale {own.scale:g}; "
             "scene.scale = 1 drops that"
         )
-    if input_map is not None and input_map.unclipped:
+    if input_map.unclipped:
         last.append(f"input.unclip: {input_map.unclipped}")
-    if input_map is not None and input_map.chromaticities is not None:
+    if input_map.chromaticities is not None:
         space = primaries.name_of(input_map.chromaticities)
         last.append(f"map in {space}: edited in Rec. 709, written in {space}")
     return [*first, *scene.notes, *last]

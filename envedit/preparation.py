@@ -204,7 +204,8 @@ class Preparation:
 
     def _shown(self, envmap, target, seed):
         """Render a map with as many samples as the target had."""
-        spp, drawn = self.settings.target.spp, getattr(Seeds.of(self.settings.seed), seed)
+        drawn = getattr(Seeds.of(self.settings.seed), seed)
+        spp = "auto" if self.settings.target.spp == "auto" else target.spp
         return rendered(self.scene, envmap, spp, drawn, self.settings.renderer.cache, target.spp)[0]
 
     def _idle(self, target, degrees, note):

@@ -12,7 +12,8 @@ import numpy as np
 
 from envedit import config, inputs
 from envedit.core import latlong
-from envedit.core.errors import ConfigError, MachineError
+from envedit.core.errors import ConfigError
+from envedit.core.extras import required
 from envedit.export import adjustments, file_resolution
 from envedit.losses import metrics
 from envedit.report import preview
@@ -53,6 +54,8 @@ class Result:
         Lights ``before`` and ``after``, of :func:`.light_list.matched`.
     core : ndarray (H, W, 3) float32
         The lights alone in the edited map, radiance that reaches the scene.
+    settings : config.Config
+        What was carried out.
     to_world : ndarray (3, 3), optional
         Rotation from the map's frame to the scene's; None: none.
     influence : ndarray (H, W), optional
@@ -77,8 +80,6 @@ class Result:
         Its pixels that the light does not explain.
     variants : list of Variant
         Other explanations of paint, likeliest first.
-    settings : config.Config, optional
-        What was carried out; None: nothing but defaults.
     memory : inputs.Given, optional
         What was given as an array or object and not as a file.
     base : Path, optional
@@ -95,6 +96,7 @@ class Result:
     views: tuple[View, ...]
     lights: dict[str, list[dict]]
     core: np.ndarray
+    settings: config.Config
     to_world: np.ndarray | None = None
     influence: np.ndarray | None = None
     frozen: np.ndarray | None = None
@@ -107,7 +109,6 @@ class Result:
     photo: Photo | None = None
     outliers: np.ndarray | None = None
     variants: list[Variant] = field(default_factory=list)
-    settings: config.Config | None = None
     memory: inputs.Given | None = None
     base: Path | None = None
 
@@ -144,11 +145,7 @@ class Result:
     def _repr_png_(self) -> bytes:
         """Show the renderings over their maps in a notebook."""
         views = [view.rows for view in self.views]
-        return preview.sheet(self.shown, self.maps, self._settings.output.tonemap, views)
-
-    @property
-    def _settings(self) -> config.Config:
-        return self.settings or config.Config()
+        return preview.sheet(self.shown, self.maps, self.settings.output.tonemap, views)
 
     def plot(self) -> Figure:
         """Draw renderings and maps: initial, target and edited; maps over azimuth and elevation, degrees.
@@ -166,12 +163,8 @@ class Result:
         MachineError
             matplotlib is not installed.
         """
-        try:
-            from matplotlib.figure import Figure
-        except ImportError:
-            how = "run pip install '.[report]' in the checkout"
-            raise MachineError(f"Result.plot: needs matplotlib, which is not installed: {how}") from None
-        figure = Figure(figsize=(12, 6.5), layout="constrained")
+        drawing = required("matplotlib.figure", "report", "Result.plot")
+        figure = drawing.Figure(figsize=(12, 6.5), layout="constrained")
         rows = (self.shown, None), (self.maps, (0, 360, -90, 90))
         for axes, (pictures, extent) in zip(figure.subplots(2, 3), rows, strict=True):
             shown = preview.known(pictures)
@@ -180,7 +173,7 @@ class Result:
                 if name not in shown:
                     axis.axis("off")
                     continue
-                axis.imshow(preview.display(shown[name], self._settings.output.tonemap, stops), extent=extent)
+                axis.imshow(preview.display(shown[name], self.settings.output.tonemap, stops), extent=extent)
                 if extent is None:
                     axis.set(title=f"{name}{preview.exposed(stops)}", xticks=[], yticks=[])
                 else:
@@ -212,7 +205,7 @@ class Result:
         """
         if self.found is None or self.posterior is None or self.posterior.sample is None:
             raise ConfigError('Result.samples: needs an edit by layers with optimizer.kind = "gauss-newton"')
-        settings = self._settings
+        settings = self.settings
         before = latlong.rotate(self.maps["initial"], self.found.turn_degrees)
         rows = inputs.active_rows(settings.input.rows, len(before)).slice
         rng = np.random.default_rng(seed)
@@ -247,11 +240,12 @@ class Result:
         from envedit.report import output_folder, run_folder
 
         folder = Path(folder).absolute()
-        settings = replace(self._settings, output=replace(self._settings.output, dir=str(folder)))
-        own = replace(self, metrics=copy.deepcopy(self.metrics), warnings=[*self.warnings])
+        settings = replace(self.settings, output=replace(self.settings.output, dir=str(folder)))
+        warnings = [*self.warnings]
         with output_folder.alone(folder):
             read = [*output_folder.inputs_of(settings, self.base)]
             read += self.memory.scene.files if self.memory and self.memory.scene else ()
             output_folder.prepare_folder(folder, output_folder.names(folder), read)
-            settings = run_folder.write_given(settings, folder, self.memory, own.warnings)
-            return run_folder.write(settings, folder, own, 0.0, self.base)
+            settings = run_folder.write_given(settings, folder, self.memory, warnings)
+            own = replace(self, settings=settings, metrics=copy.deepcopy(self.metrics), warnings=warnings)
+            return run_folder.write(folder, own, import_s=0.0)

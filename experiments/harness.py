@@ -42,9 +42,10 @@ import OpenEXR
 from envedit import config, sweep
 from envedit.cli import sweep as options
 from envedit.core import latlong
-from envedit.core.atomic_files import write_atomically
+from envedit.core.atomic_files import make_folder, write_atomically
 from envedit.core.color import tonemap
 from envedit.core.errors import ConfigError, EnveditError, InputError
+from envedit.core.extras import required
 from envedit.images import images
 from experiments import call
 from experiments.summary import markdown, values
@@ -263,13 +264,10 @@ def sheets(experiment: Experiment, done: Sequence[Done], folder: Path) -> list[P
 def figure(file: Path, rows: int, columns: int, size: tuple[float, float], **subplots):
     """Give the panels of a figure to draw in, as ``matplotlib.pyplot.subplots``, and write it.
 
-    ``size`` is width and height in inches. ConfigError if matplotlib is missing.
+    ``size`` is width and height in inches. MachineError if matplotlib is missing.
     """
-    try:
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise ConfigError("no figure: matplotlib is missing: run pip install '.[report]'") from None
-    drawn = Figure(figsize=size, layout="constrained", dpi=110)
+    drawing = required("matplotlib.figure", "report", "a figure")
+    drawn = drawing.Figure(figsize=size, layout="constrained", dpi=110)
     panels = drawn.subplots(rows, columns, **subplots)
     for panel in np.ravel(panels):
         panel.grid(alpha=0.3)
@@ -287,15 +285,6 @@ def add_options(parser: argparse.ArgumentParser, out: Path) -> None:
     parser.add_argument("--set", action="append", default=[], dest="sets", metavar="table.key=value")
     parser.add_argument("--dry-run", action="store_true", help="list the cases; compute nothing")
     options.add_options(parser)
-
-
-def make(folder: Path) -> Path:
-    """Make a folder, and return it; InputError if it cannot be made."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be made ({error.strerror}); give another folder") from None
-    return folder
 
 
 def main(name: str, about: str, experiment: Experiment, argv: Sequence[str] | None = None) -> int:
@@ -339,7 +328,7 @@ def _act(name, experiment, given):
             return 0
         if missing:
             print(sweep.table(missing), file=sys.stderr)
-    done, to = done_of(cases, out), make(given.to or out)
+    done, to = done_of(cases, out), make_folder(given.to or out)
     if given.action == "sheet":
         draw = experiment.draw
         if not draw and experiment.panels is edit_panels and cases[0][0].result == call.RESULT:

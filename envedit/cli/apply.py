@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 
 from envedit.cli import doctor, map_command
+from envedit.core.atomic_files import make_folder
 from envedit.core.errors import ConfigError
 
 LOOK = ".toml"
@@ -48,6 +49,7 @@ def _apply(arguments, console):
     files = [_files(folder, source, len(amounts)) for source in maps]
     _check(files)
     selected = [looks.read(name) for name in names]
+    make_folder(folder)
     start = selected[0] if len(selected) == 2 else None
 
     # ---- Map by map, each read once
@@ -57,7 +59,6 @@ def _apply(arguments, console):
         input_map = map_command.read(source, arguments, console)
         for amount, path in zip(amounts, targets, strict=True):
             edited = look_transfer.apply(input_map.radiance, selected[-1], amount, start)
-            folder.mkdir(parents=True, exist_ok=True)
             map_command.write(path, input_map.as_stored(edited), input_map, console)
             console.facts["files"].append({"map": source, "file": str(path), "amount": amount})
             console.say(f"{path}: {source} in the light of {names[-1]}, amount {amount:.3g}")

@@ -12,6 +12,7 @@ KINDS = {
     "fits": "SIRENs fitted to maps",
     "renderings": "renderings of initial and target maps",
     "usd": "scenes that were USD files",
+    "scene_files": "which files of scenes can be read",
 }
 
 
@@ -28,6 +29,9 @@ def main(argv: list[str] | None = None) -> int:
     code = 0
     for kind, what in KINDS.items():
         folder, sizes, failed = _visit(kind, arguments.empty)
+        if folder is None:
+            print("no home folder: nothing is kept")
+            break
         entries = f"{len(sizes)} {'entry' if len(sizes) == 1 else 'entries'}, {sum(sizes) / 1e6:.1f} MB"
         print(f"{folder}: {what}: {entries}{' deleted' if arguments.empty else ''}")
         if failed is not None:

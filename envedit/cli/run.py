@@ -142,7 +142,7 @@ def _edit(settings, base, budget, resume, console, begun):
             result.notes = notes + result.notes
             result.metrics["choices"] = result.notes
             progress.stage("writing")
-        _write(result, folder, base, import_s, console, result.notes[len(notes) :])
+        _write(result, folder, import_s, console, result.notes[len(notes) :])
         return 0
     except pipeline.Stopped as stop:
         _keep_map(folder, stop)
@@ -160,11 +160,11 @@ def _edit(settings, base, budget, resume, console, begun):
         return 130
 
 
-def _write(result, folder, base, import_s, console, notes):
+def _write(result, folder, import_s, console, notes):
     """Write the results of an edit, and say what they are."""
     from envedit.report import run_folder
 
-    for line in run_folder.write(result.settings, folder, result, import_s, base):
+    for line in run_folder.write(folder, result, import_s):
         console.warn(line)
     for line in notes:
         console.say(line)
@@ -200,11 +200,11 @@ def _export_initial(settings, base, file, console):
             initial_rendering.check_export(view_file)
 
         # ---- The picture, marked by what it is made from
-        envmap, warnings = inputs.load_map(settings.input, scene)
-        notes = inputs.notes(settings.input, scene)
-        source = inputs.source_of(settings.input, scene)
-        settings = replace(settings, input=replace(settings.input, envmap=source))
-        picture = initial_rendering.initial(scene, envmap, settings)
+        input_map = inputs.read_map(settings.input, scene, settings.input.width)
+        notes = inputs.notes(settings.input, scene, input_map)
+        warnings = input_map.warnings
+        settings = replace(settings, input=replace(settings.input, envmap=input_map.source))
+        picture = initial_rendering.initial(scene, input_map.radiance, settings)
         tonemap = initial_rendering.export_tonemap(file, picture, settings)
         for view_file, rows in files:
             warnings += initial_rendering.export(view_file, picture[rows], settings, tonemap)
@@ -244,8 +244,8 @@ def _dry_run(settings, base, console):
     with output_folder.alone(folder), console.progress() as progress:
         progress.stage("rendering the target")
         scene = inputs.load_scene(settings.scene, base)
-        envmap, warnings = inputs.load_map(settings.input, scene)
-        notes = inputs.notes(settings.input, scene)
+        input_map = inputs.read_map(settings.input, scene, settings.input.width)
+        envmap = input_map.radiance
         target = make_target(settings, scene, envmap)
         preview.preview(
             picture_file,
@@ -255,10 +255,10 @@ def _dry_run(settings, base, console):
             views=[view.rows for view in scene.views],
         )
         images.write_exr(radiance_file, target.picture, {"content": "target"}, panorama=False)
-    for line in (*warnings, *target.warnings):
+    for line in (*input_map.warnings, *target.warnings):
         console.warn(line)
     files = {file.name: str(file.resolve()) for file in (picture_file, radiance_file)}
-    for line in (*notes, target.source, *files.values()):
+    for line in (*inputs.notes(settings.input, scene, input_map), target.source, *files.values()):
         console.say(line)
     console.facts["files"] = files
     return 0
@@ -298,7 +298,7 @@ def _verdict(measured):
 
     painted = measured["painted"]
     if painted:
-        line = _painted_verdict(painted)
+        line = metrics.painted_verdict(painted)
     elif not measured["iterations"] and measured["initial"]["log_rmse"] == 0:
         measure = "log RMSE" if metrics.saturated([measured["render"]]) else "PSNR"
         score = metrics.score(measured["render"], [])
@@ -312,17 +312,6 @@ def _verdict(measured):
     if camera := measured["camera"]:
         line += f"; {camera['summary']}"
     return line + f", {measured['timing']['total_s']:.1f} s"
-
-
-def _painted_verdict(painted):
-    if painted["towards"] is None:
-        return "share of the painted change reached: unknown"
-    line = f"{100 * painted['towards']:.0f} % of the painted change reached"
-    if painted["reachable"] is not None:
-        line += f" ({100 * painted['reachable']:.0f} % feasible)"
-    if painted["elsewhere"] is not None:
-        line += f", mean change elsewhere {painted['elsewhere']:.3f}"
-    return line
 
 
 def _change(before, after):

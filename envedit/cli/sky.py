@@ -44,13 +44,13 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _sky(arguments, console):
-    from envedit.images import analytic_sky
+    from envedit import api
     from envedit.maps import map_file
 
     azimuth, elevation = _sun(arguments)
     path = map_file.output_path(arguments.out, "sky", [], arguments.overwrite)
     doctor.select()
-    sky = analytic_sky.sunsky(arguments.width, azimuth, elevation, arguments.turbidity)
+    sky = api.sunsky(arguments.width, azimuth, elevation, arguments.turbidity)
     map_file.write(path, sky)
     console.facts |= {"files": {"map": str(path)}, "azimuth": azimuth, "elevation": elevation}
     console.say(f"sun at azimuth {azimuth:.2f}, elevation {elevation:.2f} degrees; {path}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import functools
 import hashlib
 import os
 import re
@@ -75,13 +76,39 @@ def opened(path: FilePath) -> BufferedReader:
     return file
 
 
+def make_folder(folder: Path) -> Path:
+    """Make a folder where there is none, and return it; InputError if it cannot be made."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be made ({error.strerror}): give another folder") from None
+    return folder
+
+
 def digest(path: FilePath) -> bytes:
     """Return the SHA-256 of a regular file.
 
-    OSError as of :func:`opened`, and for a file of more than :data:`MOST_BYTES`, which is no input of a run.
+    InputError if it cannot be read, or has more than :data:`MOST_BYTES`: it is no input of a run.
     """
-    with opened(path) as file:
-        size = os.fstat(file.fileno()).st_size
-        if size > MOST_BYTES:
-            raise OSError(errno.EFBIG, f"{size} bytes, expected at most {MOST_BYTES}", os.fspath(path))
-        return hashlib.file_digest(file, "sha256").digest()
+    try:
+        with opened(path) as file:
+            size = os.fstat(file.fileno()).st_size
+            if size > MOST_BYTES:
+                raise InputError(f"{path}: {size} bytes, expected at most {MOST_BYTES}")
+            return hashlib.file_digest(file, "sha256").digest()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+
+
+def known_digest(path: FilePath) -> bytes:
+    """Return :func:`digest`, computed once while size and time of the last change stay the same."""
+    try:
+        status = os.stat(path)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+    return _digest(os.fspath(path), status.st_size, status.st_mtime_ns)
+
+
+@functools.lru_cache(maxsize=4096)
+def _digest(path, size, changed):
+    return digest(path)

@@ -33,7 +33,7 @@ class InputError(EnveditError):
 
 
 class MachineError(EnveditError):
-    """No kernel can run on this machine: no usable LLVM (exit code 4)."""
+    """The machine lacks what is needed: an LLVM, or a package of an extra (exit code 4)."""
 
     exit_code = 4
 

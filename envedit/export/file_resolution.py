@@ -36,11 +36,12 @@ class Found:
     level: float = 1.0
 
 
-def at_full_resolution(settings: config.Config, result: results.Result) -> np.ndarray | None:
+def at_full_resolution(result: results.Result) -> np.ndarray | None:
     """Carry a result to the resolution of its input's file, in its units; None where that has no more texels.
 
     InputError or NumericalError if the file cannot be read any more, or the carried map is not finite.
     """
+    settings = result.settings
     if result.given.size[0] <= settings.input.width:
         return None
     own = result.given.at_file_size(settings.input)

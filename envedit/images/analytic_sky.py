@@ -5,10 +5,6 @@ import math
 import numpy as np
 
 from envedit.core import latlong
-from envedit.core.errors import ConfigError
-
-MAX_WIDTH = 16384
-"""Texels across the widest sky."""
 
 SUN_APERTURE = 0.5358
 """Angle across the sun's disc in degrees, the plugin's default."""
@@ -32,46 +28,12 @@ def sunsky(
     off). Below the horizon the plugin is black; here lies a ground that reflects ``ground_albedo *
     irradiance / pi``, as a black half would be degenerate in log space.
 
-    Parameters
-    ----------
-    width : int
-        Texels across, even, from 6 to 16384; the height is half of it.
-    azimuth : float
-        Degrees along the columns: the sun stands at column ``azimuth / 360 * width - 1/2``.
-    elevation : float
-        Degrees above the horizon, 0 to 90: the sun stands at row ``(90 - elevation) / 180 * (width / 2 -
-        1)``.
-    turbidity : float
-        Haze, 1 (clear) to 10.
-    ground_albedo : float
-        Reflectance of the ground, 0 to 1; it lights the sky as well.
-    sun_scale, sky_scale : float
-        Factors on the radiance of either, at least 0.
-
-    Returns
-    -------
-    array (width / 2, width, 3) float32
-        Linear radiance in the plugin's units.
-
-    Raises
-    ------
-    ConfigError
-        If a parameter is out of its range.
+    ``width``, ``azimuth``, ``elevation`` and ``turbidity`` are those of :func:`envedit.sunsky`: the sun
+    stands at column ``azimuth / 360 * width - 1/2``, row ``(90 - elevation) / 180 * (width / 2 - 1)``.
+    ``ground_albedo`` is the ground's reflectance, 0 to 1, which lights the sky as well; ``sun_scale`` and
+    ``sky_scale`` are factors on the radiance of either. Returned is linear radiance in the plugin's units,
+    (width / 2, width, 3) float32.
     """
-    # ---- Refuse what is out of range
-    if width < 6 or width % 2 or width > MAX_WIDTH:
-        raise ConfigError(f"sunsky: width must be even, from 6 to {MAX_WIDTH}, got {width}")
-    for key, value, low, high in (
-        ("azimuth", azimuth, -1e6, 1e6),
-        ("elevation", elevation, 0, 90),
-        ("turbidity", turbidity, 1, 10),
-        ("ground_albedo", ground_albedo, 0, 1),
-        ("sun_scale", sun_scale, 0, 1e6),
-        ("sky_scale", sky_scale, 0, 1e6),
-    ):
-        if not low <= value <= high:  # a NaN is not in any range either
-            raise ConfigError(f"sunsky: {key} must be from {low:g} to {high:g}, got {value}")
-
     # ---- Sky and sun, each an emitter of its own
     height = width // 2
     # The plugin is black for a sun in the horizon itself, to float32: one hundredth of a degree is above it.

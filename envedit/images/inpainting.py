@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from envedit.core import latlong
-from envedit.core.errors import MachineError
+from envedit.core.extras import required
 
 MOST_PIXELS = 1024
 """Pixels across of the projection: a larger one takes seconds, and what is filled in is smooth."""
@@ -35,7 +35,7 @@ def filled(envmap: np.ndarray, weight: np.ndarray) -> np.ndarray:
     is :data:`RADIUS` pixels around the region, in each channel. NothingAroundError if the weight is above 0
     everywhere, MachineError if OpenCV is not installed.
     """
-    cv2 = _opencv()
+    cv2 = required("cv2", "inpaint", 'input.regions: action = "fill"')
     mask = weight > 0
     if not mask.any():
         return envmap
@@ -98,17 +98,6 @@ def _inpainted(cv2, known, unknown, ring):
         radiance = np.exp(low + np.clip(np.float64(done), 0, CODES) / scale)
         image[..., c] = np.clip(radiance, around.min(), around.max())
     return image
-
-
-def _opencv():
-    try:
-        import cv2
-    except ImportError:
-        raise MachineError(
-            'input.regions: action = "fill" needs OpenCV, which is not installed: '
-            "run pip install '.[inpaint]' in the checkout"
-        ) from None
-    return cv2
 
 
 def _cap(mask):

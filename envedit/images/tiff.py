@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from envedit.core.errors import InputError, MachineError
+from envedit.core.extras import required
 from envedit.core.types import Info
 from envedit.images.headers import check_declared, damaged
 
@@ -17,10 +18,7 @@ PREMULTIPLIED, STRAIGHT = 1, 2
 
 def read(name: str, head: bytes, info: Info, stored: bool) -> np.ndarray:
     """Decode a file; arguments as in :mod:`.headers`. Further channels than alpha are left out."""
-    try:
-        import tifffile
-    except ImportError:
-        raise MachineError(f"{name}: TIFF needs tifffile, which is not installed: {HOW}") from None
+    tifffile = required("tifffile", "tiff", f"{name}: TIFF")
     with tifffile.TiffFile(name) as file:
         page = file.pages.first
         check_declared(name, page.imagewidth, page.imagelength)

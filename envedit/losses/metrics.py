@@ -231,6 +231,18 @@ def painted(
     }
 
 
+def painted_verdict(measured: dict) -> str:
+    """Say how far a painted picture was followed: ``towards``, ``reachable``, ``elsewhere`` of a run."""
+    if measured["towards"] is None:
+        return "the painted change is below the noise of the renderings"
+    line = f"{100 * measured['towards']:.0f} % of the painted change reached"
+    if measured["reachable"] is not None:
+        line += f" ({100 * measured['reachable']:.0f} % feasible)"
+    if measured["elsewhere"] is not None:
+        line += f", mean change elsewhere {measured['elsewhere']:.3f}"
+    return line
+
+
 def _log(values):
     return np.log(np.maximum(values, 0) + LOG_EPS)
 

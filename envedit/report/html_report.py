@@ -15,7 +15,7 @@ import numpy as np
 from envedit import config
 from envedit.core.atomic_files import write_atomically
 from envedit.core.types import FilePath
-from envedit.losses.metrics import saturated, score, worse
+from envedit.losses.metrics import painted_verdict, saturated, score, worse
 from envedit.report import html_parts as parts
 from envedit.report import html_tables as tables
 from envedit.report import preview
@@ -29,12 +29,13 @@ NAMED = 5
 """Numbers that are not finite which a warning names, at most."""
 
 
-def write_report(path: FilePath, result: Result, settings: config.Config, manifest: dict) -> None:
+def write_report(path: FilePath, result: Result, manifest: dict) -> None:
     """Write ``report.html``: verdict, pictures, differences, curves, tables and configuration in one file.
 
-    ``settings`` are what was carried out, ``manifest`` is that of :func:`.manifest.manifest`. Raises
-    InputError if the file cannot be written.
+    ``manifest`` is that of :func:`.manifest.manifest`. Raises InputError if the file cannot be written.
     """
+    settings = result.settings
+
     # ---- What is shown
     lost: list[str] = []
     metrics = plain(result.metrics, "metrics", lost)
@@ -233,15 +234,9 @@ def _verdict(metrics):
             verdict += f" (noise alone: {score(metrics['ceiling'], rendered)})"
         if worse(after, before):
             alarm = "further from the target than the unedited one"
-    elif painted["towards"] is None:
-        verdict = "The painted change is below the noise of the renderings"
     else:
-        verdict = f"<strong>{100 * painted['towards']:.0f} %</strong> of the painted change reached"
-        if painted["reachable"] is not None:
-            verdict += f" ({100 * painted['reachable']:.0f} % feasible)"
-        if painted["elsewhere"] is not None:
-            verdict += f" · mean change elsewhere {painted['elsewhere']:.3f}"
-        if painted["towards"] < 0:
+        verdict = painted_verdict(painted)
+        if painted["towards"] is not None and painted["towards"] < 0:
             alarm = "further from the paint than the unedited one"
 
     # ---- The map, and the time

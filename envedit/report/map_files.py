@@ -65,23 +65,21 @@ def write_look(folder: Path, result: results.Result) -> list[str]:
     return []
 
 
-def write_scene(
-    settings: config.Config, folder: Path, result: results.Result, base: Path | None = None
-) -> list[str]:
+def write_scene(folder: Path, result: results.Result) -> list[str]:
     """Write ``edited.xml``, the scene lit by the edited map, which lies beside it, and ``edited.usda``.
 
     Returns a warning, if it cannot be written.
     """
-    edited = f"edited.{settings.output.format}"
+    edited = f"edited.{result.settings.output.format}"
     lights = result.lights["after"]
-    chosen = settings.scene
+    chosen = result.settings.scene
     try:
         below = None
         if conversion.is_usd(chosen.file):
             below = os.path.relpath(chosen.file, folder), conversion.kept(chosen.file).stage
         stage = usd_scene.text(edited, "edited_sky.exr", lights, result.to_world, result.given.scale, below)
         atomic_files.write_atomically(folder / "edited.usda", stage.encode())
-        text = scene.relit(chosen.file, edited, dict(chosen.parameters), base, chosen.up, chosen.scale)
+        text = scene.relit(chosen.file, edited, dict(chosen.parameters), result.base, chosen.up, chosen.scale)
     except InputError as error:  # the scene's files may be gone by now
         return [f"edited.xml or edited.usda is not written: {error}"]
     atomic_files.write_atomically(folder / "edited.xml", text.encode())

@@ -23,31 +23,30 @@ if TYPE_CHECKING:
     from envedit import results
 
 
-def write(
-    settings: config.Config, folder: Path, result: results.Result, import_s: float, base: Path | None = None
-) -> list[str]:
-    """Write the result of settings that were carried out; the checkpoint goes last of all.
+def write(folder: Path, result: results.Result, import_s: float) -> list[str]:
+    """Write a result; the checkpoint goes last of all.
 
     Files of the same names are replaced, and the timing of the result's metrics is completed, with the
-    seconds ``import_s`` that imports took. ``base`` is the folder that file names in scene parameters are
-    relative to. Returns warnings: the result's, and numbers that were not finite.
+    seconds ``import_s`` that imports took. Returns warnings: the result's, and numbers that were not finite.
     """
+    settings = result.settings
+
     # ---- Maps and renderings
     start = time.perf_counter()
-    _write_maps(settings, folder, result)
-    _write_renderings(settings, folder, result)
-    _write_full_resolution(settings, folder, result)
+    _write_maps(folder, result)
+    _write_renderings(folder, result)
+    _write_full_resolution(folder, result)
     map_files.write_lights(folder, result)
     result.warnings += map_files.write_look(folder, result)
     if settings.output.scene:
-        result.warnings += map_files.write_scene(settings, folder, result, base)
+        result.warnings += map_files.write_scene(folder, result)
     maps_written = time.perf_counter()
 
     # ---- What explains the run later
     atomic_files.write_atomically(folder / "config.toml", config.to_toml(settings).encode())
     manifest.write_history(folder / "history.csv", result.history)
     facts = manifest.manifest(
-        {"seed": settings.seed, "preset": settings.preset}, _inputs(settings, result), settings.variant
+        {"seed": settings.seed, "preset": settings.preset}, _inputs(result), settings.variant
     )
     manifest.write_json(folder / "manifest.json", facts)
 
@@ -64,7 +63,7 @@ def write(
             settings.output.tonemap,
             views=[view.rows for view in result.views],
         )
-        html_report.write_report(folder / "report.html", result, settings, facts)
+        html_report.write_report(folder / "report.html", result, facts)
     timing["report_s"] = round(time.perf_counter() - maps_written, 3)
     timing["total_s"] = round(timing["total_s"] + timing["report_s"], 3)
 
@@ -105,8 +104,9 @@ def write_given(
     return settings
 
 
-def _inputs(settings, result):
+def _inputs(result):
     """Return the files that a run has read, by what they are to it; several of a kind are numbered."""
+    settings = result.settings
     paths = {"envmap": result.given.source, "scene": result.scene or "", "start": settings.optimizer.start}
     for role, files in (("target", settings.target.files), ("mask", settings.target.masks)):
         paths |= {role if len(files) == 1 else f"{role} {i}": file for i, file in enumerate(files)}
@@ -114,10 +114,11 @@ def _inputs(settings, result):
     return {role: path for role, path in paths.items() if os.path.isfile(path)}
 
 
-def _write_maps(settings, folder, result):
+def _write_maps(folder, result):
     """Write the edited map, its layers, its other explanations, and what the target determines of it."""
     input_map = result.given
-    result.warnings += map_files.write_map(settings.output, folder / "edited", result.envmap, input_map)
+    output = result.settings.output
+    result.warnings += map_files.write_map(output, folder / "edited", result.envmap, input_map)
     layers = {
         "edited": result.envmap,
         "initial": input_map.stored,
@@ -131,7 +132,7 @@ def _write_maps(settings, folder, result):
     if result.posterior is not None:
         layers["deviation"] = result.posterior.deviation
     layered_exr.write(folder / "edited_layers.exr", layers, chromaticities=input_map.chromaticities)
-    result.warnings += variants.write(folder / variants.FOLDER, result.variants, settings.output, input_map)
+    result.warnings += variants.write(folder / variants.FOLDER, result.variants, output, input_map)
     if result.photo is not None:
         pictures = preview.photograph(result.photo, result.render, result.outliers)
         images.write_png(folder / "photograph.png", np.concatenate(pictures, axis=1))
@@ -139,25 +140,25 @@ def _write_maps(settings, folder, result):
         images.write_png(folder / "unreachable.png", preview.unreachable(result.reach))
 
 
-def _write_renderings(settings, folder, result):
+def _write_renderings(folder, result):
     """Write the renderings, and each view of them where there are several."""
     views = [view.rows for view in result.views]
     for name, picture in result.renders.items():
         for file, rows in output_folder.of_views(f"render_{name}.exr", views):
             alpha = None if result.alpha is None else result.alpha[rows]
-            source = {"source": settings.scene.file}
+            source = {"source": result.settings.scene.file}
             images.write_exr(folder / file, picture[rows], source, panorama=False, alpha=alpha)
 
 
-def _write_full_resolution(settings, folder, result):
+def _write_full_resolution(folder, result):
     """Write the edit at the resolution of its input's file, where that is larger."""
-    if not settings.output.full:
+    if not result.settings.output.full:
         return
     try:
-        full = file_resolution.at_full_resolution(settings, result)
+        full = file_resolution.at_full_resolution(result)
         if full is not None:
             result.warnings += map_files.write_map(
-                settings.output, folder / "edited_full", full, result.given
+                result.settings.output, folder / "edited_full", full, result.given
             )
     except MemoryError:
         result.warnings.append(

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from envedit import config, inputs
-from envedit.core.errors import InputError
+from envedit.core.atomic_files import make_folder
 from envedit.losses import metrics
 from envedit.report import map_files, preview
 from envedit.scene.scene import Scene
@@ -90,10 +90,7 @@ def write(
     """
     if not variants:
         return []
-    try:
-        folder.mkdir(exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be made ({error.strerror or error})") from error
+    make_folder(folder)
     warnings = []
     for number, one in enumerate(variants, 1):
         warnings += map_files.write_map(settings, folder / str(number), one.envmap, input_map)

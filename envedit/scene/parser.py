@@ -368,10 +368,7 @@ def hash_node(digest: hashlib._Hash, node: mi.parser.SceneNode) -> None:
     for key, value in node.props.items():
         digest.update(f"{key}=".encode())
         if key == "filename":
-            try:
-                digest.update(atomic_files.digest(value))
-            except OSError as error:
-                raise InputError(f"{value}: cannot be read ({error.strerror})") from None
+            digest.update(atomic_files.digest(value))
         else:
             _hash_value(digest, value)
 

@@ -85,10 +85,7 @@ def errors(files: Sequence[SceneFile]) -> list[InputError]:
 
 def _key(file):
     """Return what a file's being good depends on."""
-    try:
-        digest = atomic_files.digest(file.path)
-    except OSError as error:
-        raise InputError(f"{file.path}: cannot be read ({error.strerror})") from None
+    digest = atomic_files.digest(file.path)
     return f"{file.plugin} {file.shape_index} {digest.hex()} Mitsuba {mi.__version__}"
 
 

@@ -135,9 +135,9 @@ def solve(
     normal = problem.curvature(point, run.start, sigma)
     note = ""
     whole = run
-    if sparing and run.history:
+    first = problem.evaluate(start, resolve=False) if sparing and run.history else None
+    if first is not None and first.residual is not None:
         before = replace(run, state=start, start=start)
-        first = problem.evaluate(start, resolve=False)
         loss = problem.unlikeliness(point, run.start, sigma) + 2 * normal.determined
         noise = problem.likelihood.noise(point.residual, sigma)
         near = problem.likelihood.noise(first.residual, sigma) < COMPARED_NOISE_RATIO * noise

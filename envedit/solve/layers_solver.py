@@ -53,7 +53,7 @@ class LayersSolver:
                 done = next(tried)
                 edit.watch.progress(done, done, "trying lights")
                 if interrupt.is_set():
-                    raise Interrupted(edit.original.copy(), 0)
+                    raise KeyboardInterrupt
 
             explanation = search.search(
                 problem,
@@ -258,6 +258,9 @@ class LayersSolver:
             seen = edit.target.photo.exposed_by(one.state["camera"][0])
             unlikeliness = problem.likelihood.at_best(seen.missed(point.rendering), SIGMA)
             tried.append((unlikeliness + problem.penalty(one.state, one.start), seen, one))
+        if not tried:  # no curve gives a finite rendering
+            edit.target = before
+            return None
         _, seen, one = min(tried, key=lambda three: three[0])
         self._curves = {other.camera.curve: float(value) for value, other, _ in tried}
         edit.target = before.developed(seen)

@@ -14,8 +14,9 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TextIO
 
-from envedit.core.atomic_files import write_atomically
-from envedit.core.errors import ConfigError, InputError
+from envedit.core.atomic_files import make_folder, write_atomically
+from envedit.core.errors import ConfigError
+from envedit.core.extras import required
 from envedit.core.processor import cores
 from envedit.core.types import FilePath
 
@@ -84,10 +85,7 @@ def sweep(
     names = [job.name for job in jobs]
     if twice := [name for name in names if names.count(name) > 1]:
         raise ConfigError(f"two jobs are called {twice[0]}")
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{out}: cannot be made ({error.strerror}): give another --out") from None
+    make_folder(out)
 
     # ---- What is to be done: one job of each content
     distinct = {job.key: job for job in reversed(jobs)}
@@ -141,15 +139,11 @@ def _on_a_cluster(run, address, threads):
     """
     if not re.fullmatch(r"((tcp|tls|wss?|ucx)://)?[^\s/]+:\d+", address):
         raise ConfigError(f"--scheduler: got {address}, expected HOST:PORT or tcp://HOST:PORT")
-    try:
-        from distributed import Client
-    except ImportError:
-        missing = "dask.distributed is missing: run pip install '.[cluster]' in the checkout"
-        raise ConfigError(f"--scheduler {address}: {missing}") from None
+    distributed = required("distributed", "cluster", f"--scheduler {address}")
     # Its tracebacks when a scheduler is gone.
     logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
     try:
-        client = Client(address, timeout=CONNECT_SECONDS, set_as_default=False)
+        client = distributed.Client(address, timeout=CONNECT_SECONDS, set_as_default=False)
         slots = sum(client.nthreads().values())
     except (OSError, ValueError) as error:
         raise ConfigError(f"--scheduler {address}: no scheduler there ({error})") from None

@@ -16,7 +16,7 @@ import envedit
 from envedit import config
 from envedit.config import presets
 from envedit.core import atomic_files
-from envedit.core.errors import ConfigError, InputError
+from envedit.core.errors import ConfigError
 from envedit.core.types import FilePath
 from envedit.losses.perceptual import installed
 
@@ -163,13 +163,4 @@ def _scene_digests(scene, base):
 
 
 def _digest(path):
-    try:
-        status = os.stat(path)
-        return _sha256(path, status.st_size, status.st_mtime_ns)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
-
-
-@functools.lru_cache(maxsize=4096)
-def _sha256(path, size, changed):  # many jobs share few maps
-    return f"sha256:{atomic_files.digest(path).hex()}"
+    return f"sha256:{atomic_files.known_digest(path).hex()}"

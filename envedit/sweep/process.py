@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import envedit
 from envedit.core import file_locks
-from envedit.core.atomic_files import write_atomically
+from envedit.core.atomic_files import make_folder, write_atomically
 from envedit.core.errors import InputError
 from envedit.core.processor import cores
 from envedit.core.types import FilePath
@@ -119,10 +119,7 @@ def run_job(
         return Outcome(job, "failed", error=f"{here}; install the same on every machine")
 
     # ---- Carry it out in its folder, which no other process works in meanwhile
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be made ({error.strerror}): give another --out") from None
+    make_folder(folder)
     command = command or job.command or COMMAND
     threads = threads or max(1, cores() // _jobs_at_a_time())
     try:

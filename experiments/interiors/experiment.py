@@ -10,10 +10,11 @@ import math
 import numpy as np
 
 from envedit.core import latlong
+from envedit.core.atomic_files import make_folder
 from envedit.core.color import tonemap
 from envedit.images import images
 from experiments import puresky
-from experiments.harness import Case, Done, Experiment, edit_panels, make
+from experiments.harness import Case, Done, Experiment, edit_panels
 
 WIDTH = 256
 LAMPS = {"ceiling": (200, 55), "desk": (165, 8), "corner": (320, 25)}
@@ -63,7 +64,7 @@ def room(lamps: dict[str, tuple[float, float]]) -> np.ndarray:
 
 def cases(args):
     maps = puresky.others()
-    folder = make(args.out / "maps").absolute()
+    folder = make_folder(args.out / "maps").absolute()
     rooms = {name: folder / f"{name.replace(' ', '_')}.exr" for name in ROOMS}
     for name, file in rooms.items():
         if not file.exists():

@@ -1,1 +1,1 @@
-"""Maps with several lights: which of them moved, and which stayed."""
+"""Looks: maps in the light of another edit."""

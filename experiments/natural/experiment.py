@@ -11,9 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
+from envedit.core.atomic_files import make_folder
 from envedit.images import analytic_sky, images
 from experiments import puresky
-from experiments.harness import Case, Done, Experiment, make
+from experiments.harness import Case, Done, Experiment
 from experiments.summary import Summary
 
 SCENES = {
@@ -42,7 +43,7 @@ def cases(args):
     data = puresky.data()
     ground = {name: str(file) for name, file in puresky.others().items()}
     analytic = {e: str(args.out.absolute() / "maps" / f"sunsky_{e}.exr") for e in (ELEVATION, *ELEVATIONS)}
-    make(args.out / "maps")
+    make_folder(args.out / "maps")
     for elevation, file in analytic.items():
         if not Path(file).exists():
             images.write_exr(file, analytic_sky.sunsky(WIDTH, 90.0, elevation))

@@ -14,10 +14,11 @@ from pathlib import Path
 
 from envedit.config import presets
 from envedit.core import latlong
+from envedit.core.atomic_files import make_folder
 from envedit.images import images
 from envedit.sweep import DONE
 from experiments import puresky
-from experiments.harness import Case, Done, Experiment, make
+from experiments.harness import Case, Done, Experiment
 from experiments.painted_edits import experiment as painted_edits
 from experiments.summary import Summary
 
@@ -105,7 +106,7 @@ def turned(file: Path, folder: Path) -> Path:
     All PureSky maps have their sun in the middle: another map alone is not another orientation of the light.
     """
     content = hashlib.sha256(file.read_bytes()).hexdigest()[:8]
-    path = make(folder.absolute()) / f"{file.stem}-turned-{content}.exr"
+    path = make_folder(folder.absolute()) / f"{file.stem}-turned-{content}.exr"
     if not path.exists():
         images.write_exr(path, latlong.rotate(images.load_envmap(str(file))[0], DEGREES))
     return path

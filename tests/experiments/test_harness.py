@@ -182,7 +182,6 @@ COUNTS = {
     "tradeoff": 6,
     "unclip": 12,
     "unclip.constants": 4,
-    "views": 36,
 }
 """Cases of every experiment over these maps."""
 

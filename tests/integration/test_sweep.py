@@ -444,7 +444,7 @@ def test_a_file_that_no_run_could_read_is_not_hashed(tmp_path):
     """A sparse file of 60 GB, which would take half a minute or more."""
     with open(tmp_path / "sky.hdr", "wb") as file:
         file.truncate(60 * 10**9)
-    with pytest.raises(InputError, match=r"sky.hdr: cannot be read \(60000000000 bytes, expected at most"):
+    with pytest.raises(InputError, match=r"sky.hdr: 60000000000 bytes, expected at most"):
         job("x", '[input]\nenvmap = "sky.hdr"', tmp_path)
 
 
@@ -580,7 +580,7 @@ def test_a_real_run_is_made(tmp_path):
 @pytest.mark.skipif(DASK, reason="dask.distributed is there")
 def test_without_dask_the_option_says_what_to_install(stub, capsys):
     where = ["--out", str(stub.out), "--scheduler", "tcp://127.0.0.1:1"]
-    assert main([str(stub.written(2)), *where], stub.command) == 2
+    assert main([str(stub.written(2)), *where], stub.command) == 4
     assert "pip install '.[cluster]'" in capsys.readouterr().err
 
 

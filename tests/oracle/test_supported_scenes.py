@@ -55,13 +55,14 @@ def test_the_initial_rendering_is_mitsuba_s_of_the_users_file(scale, inside, env
     given = {"input": {"envmap": envmap, "width": 16}, "scene": {"file": str(path), "width": 16}}
     settings = config.from_dict(given, tmp_path)
     lit = inputs.load_scene(settings.scene)
-    radiance, warnings = inputs.load_map(settings.input, lit)
+    given_map = inputs.read_map(settings.input, lit, settings.input.width)
+    radiance, warnings = given_map.radiance, given_map.warnings
     expected = plain(used)
     close(lit.render(radiance, SPP, 3), expected)
     transport = LightTransport.build(lit, 8, 16, spp=128)
     transport.resolve(radiance)
     close(transport.apply(mi.TensorXf(radiance)).numpy(), expected, 0.02)
-    said = " ".join(inputs.notes(settings.input, lit))
+    said = " ".join(inputs.notes(settings.input, lit, given_map))
     assert not warnings and (f"scale {scale}" in said) == (scale is not None)
     assert ("not the scene's own" in said) == (envmap == "other.exr")
     assert (f"the scene's own, {tmp_path / 'own.exr'}" in said) == (envmap == "auto")
@@ -197,7 +198,8 @@ def map_of(parts, folder, **keys):
     given = {"input": {"width": 256}, "scene": {"file": str(path), "width": 16} | keys}
     settings = config.from_dict(given, folder)
     lit = inputs.load_scene(settings.scene)
-    return lit, inputs.read_map(settings.input, lit, 256).radiance, inputs.notes(settings.input, lit)
+    given_map = inputs.read_map(settings.input, lit, 256)
+    return lit, given_map.radiance, inputs.notes(settings.input, lit, given_map)
 
 
 @pytest.mark.slow

@@ -166,7 +166,7 @@ def at_both_resolutions(folder, given, **tables):
     small = {"input": of_map, "scene": {"width": 8}, "output": {"spp": 4}}
     settings = config.from_dict(small | tables, folder)
     result = pipeline.run(settings)
-    return wide, settings, result, file_resolution.at_full_resolution(settings, result)
+    return wide, settings, result, file_resolution.at_full_resolution(result)
 
 
 def interrupting(stage="editing", step=None):

@@ -148,7 +148,8 @@ def loaded(path: Path, width=0):
     """Load a file as a run does: scene, radiance of its map, and what the run says."""
     settings = config.from_dict({"input": {"width": 16}, "scene": {"file": str(path)}}, path.parent)
     lit = inputs.scenes.load(settings.scene.file, width)
-    return lit, inputs.load_map(settings.input, lit)[0], inputs.notes(settings.input, lit)
+    input_map = inputs.read_map(settings.input, lit, settings.input.width)
+    return lit, input_map.radiance, inputs.notes(settings.input, lit, input_map)
 
 
 # ---- plugins -----------------------------------------------------------------------------------------------

@@ -75,10 +75,11 @@ def write(path, settings=None, manifest=None, metrics=None, **changes):
         "views": (),
         "warnings": [],
         "notes": ["renderer.spp = 64"],
+        "settings": settings or config.Config(),
     }
     result = Result(**{**found, **changes})
     manifest = {"variant": "llvm_ad_rgb"} if manifest is None else manifest
-    html_report.write_report(path, result, settings or config.Config(), manifest)
+    html_report.write_report(path, result, manifest)
     return Page(path)
 
 
@@ -137,7 +138,7 @@ def test_report_of_paint_says_how_far_it_was_followed(tmp_path):
     painted = {"towards": 0.81, "elsewhere": 0.0123, "reachable": 0.9}
     reach = Reach(share=0.9, picture=grey(0.5), residual=grey(0.1), envmap=grey(1.0))
     page = write(tmp_path / "r.html", metrics=psnr | {"painted": painted}, reach=reach)
-    assert "81 % of the painted change reached (90 % feasible) · mean change elsewhere 0.012" in page.text
+    assert "81 % of the painted change reached (90 % feasible), mean change elsewhere 0.012" in page.text
     assert "What was painted" in page.text and "90 % of the painted change is feasible" in page.text
     assert "further from" not in page.text  # the whole picture may well be
     worse = write(tmp_path / "w.html", metrics={"painted": painted | {"towards": -0.2}})

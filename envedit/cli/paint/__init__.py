@@ -2,58 +2,54 @@
 
 from __future__ import annotations
 
-import argparse
-import sys
 import threading
 import webbrowser
 from typing import Any
+
+from envedit.cli.console import Console, exit_code, make_parser
+from envedit.core.errors import ConfigError
+from envedit.core.extras import required
 
 PORT = 8765
 
 
 def main(argv: list[str] | None = None) -> int:
     """Serve the page until Ctrl-C; returns the exit code."""
-    from envedit.core.errors import EnveditError
+    parser = _parser()
+    arguments = parser.parse_args(argv)
+    if arguments.name is None and arguments.envmap is not None:
+        arguments.name = "sphere"
+    if arguments.name is None and (arguments.camera or arguments.preset):
+        parser.error("--camera and --preset are of a CONFIG or SCENE: name one")
+    return exit_code(Console(), lambda: _paint(arguments))
 
-    arguments = _parser().parse_args(argv)
-    try:
-        import starlette  # noqa: F401
-        import uvicorn
-        import websockets  # noqa: F401
-    except ImportError as error:
-        how = "run pip install '.[paint]' in the checkout"
-        print(f"envedit: paint needs the package {error.name}: {how}", file=sys.stderr)
-        return 4
+
+def _paint(arguments):
+    # ---- What is painted on
+    for module in ("starlette", "websockets"):
+        required(module, "paint", "paint")
+    uvicorn = required("uvicorn", "paint", "paint")
     from envedit.cli.paint import project
     from envedit.cli.paint.server import HOST, Server
 
-    try:
-        opened = None
-        if arguments.name is not None:
-            opened = project.opened(
-                arguments.name, arguments.envmap or "", arguments.preset, arguments.camera or ""
-            )
-        elif arguments.envmap:
-            opened = project.opened("sphere", arguments.envmap, arguments.preset)
-        if opened is not None:
-            with opened.alone():  # an error here if another server has it; the worker holds it
-                pass
-    except EnveditError as error:
-        print(f"envedit: {error}", file=sys.stderr)
-        return error.exit_code
+    opened = None
+    if arguments.name is not None:
+        opened = project.opened(
+            arguments.name, arguments.envmap or "", arguments.preset, arguments.camera or ""
+        )
+        with opened.alone():  # an error here if another server has it; the worker holds it
+            pass
+
+    # ---- Where it is served
     try:
         server = Server(opened, arguments.port)
     except OSError as error:
-        reason = error.strerror or error
-        print(
-            f"envedit: port {arguments.port} on {HOST}: cannot be used ({reason}): another `envedit paint` "
-            "may run there; end it, or give another with --port",
-            file=sys.stderr,
-        )
-        return 2
+        raise ConfigError(
+            f"port {arguments.port} on {HOST}: cannot be used ({error.strerror or error}): another "
+            "`envedit paint` may run there; end it, or give another with --port"
+        ) from None
     except OverflowError:
-        print(f"envedit: --port: got {arguments.port}, expected 0 to 65535", file=sys.stderr)
-        return 2
+        raise ConfigError(f"--port: got {arguments.port}, expected 0 to 65535") from None
     print(f"envedit paint: {server.url}", flush=True)
     print("Ctrl-C ends it.", flush=True)
     if not arguments.no_browser:
@@ -92,14 +88,17 @@ def serve(server: Any, uvicorn: Any) -> None:
 
 
 def _parser():
-    parser = argparse.ArgumentParser(
-        prog="envedit paint",
-        description="Paint on the rendering in the browser; the environment map follows while you paint.",
-        epilog="examples:\n  envedit paint\n  envedit paint sphere --envmap sky.hdr\n"
-        "  envedit paint edit.toml\n  envedit paint edit_out/painted.toml\n\n"
+    parser = make_parser(
+        "paint",
+        "Paint on the rendering in the browser; the environment map follows while you paint.",
+        [
+            "envedit paint",
+            "envedit paint sphere --envmap sky.hdr",
+            "envedit paint edit.toml",
+            "envedit paint edit_out/painted.toml",
+        ],
         "Results and painted.toml, which `envedit run` carries out as well, go to the folder of the results\n"
         "that `envedit run` would write to. Needs the extra paint: pip install '.[paint]' in a checkout.",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument(
         "name",
@@ -114,7 +113,3 @@ def _parser():
     parser.add_argument("--port", type=int, default=PORT, help=f"port (default: {PORT}; 0: any)")
     parser.add_argument("--no-browser", action="store_true", help="only print the address")
     return parser
-
-
-if __name__ == "__main__":
-    sys.exit(main())

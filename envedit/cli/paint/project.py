@@ -96,7 +96,7 @@ class Project:
 
         InputError if it cannot be made, or another server has it.
         """
-        self._make_folder()
+        atomic_files.make_folder(self.folder)
         with contextlib.ExitStack() as stack:
             try:
                 stack.enter_context(file_locks.locked(self.folder / "painted.lock"))
@@ -107,15 +107,9 @@ class Project:
                 ) from None
             yield
 
-    def _make_folder(self):
-        try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputError(f"{self.folder}: cannot be made: {error.strerror or error}") from error
-
     def keep(self, document: Document, start: str = "") -> None:
         """Write ``painted.toml``, whole or not at all; as of :meth:`text`; InputError if it cannot."""
-        self._make_folder()
+        atomic_files.make_folder(self.folder)
         atomic_files.write_atomically(self.folder / NAME, self.text(document, start).encode())
 
 

@@ -658,7 +658,7 @@ class Session:
             watch = pipeline.Watch(stage, self._progress)
             result = pipeline.run(settings, folder=folder, base=base, watch=watch)
             stage("writing")
-            return result, run_folder.write(settings, folder, result, import_s, base)
+            return result, run_folder.write(folder, result, import_s)
 
     def _match(self, settings):
         """Find the light of a photograph; its map is painted on, at the resolution of the input's file."""

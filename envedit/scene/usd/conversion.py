@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import functools
 import hashlib
-import importlib.util
 import json
 import os
 import shutil
@@ -19,7 +18,8 @@ from typing import NamedTuple
 
 from envedit.core import atomic_files, shipped
 from envedit.core.array_cache import cache_folder
-from envedit.core.errors import ConfigError, InputError, MachineError
+from envedit.core.errors import ConfigError, InputError
+from envedit.core.extras import required
 from envedit.core.types import FilePath
 from envedit.scene import scene_files
 
@@ -61,9 +61,7 @@ def convert(file: FilePath, xml: Path, camera: str = "", time: float | None = No
     """
     # ---- Refuse what cannot be read or written
     file = Path(file).absolute()
-    if importlib.util.find_spec("pxr") is None:
-        how = "pip install 'envedit-hdr[usd]'"
-        raise MachineError(f"{file}: reading USD needs the package usd-core: {how}")
+    required("pxr", "usd", os.fspath(file))
     if not os.path.isfile(file):
         raise InputError(f"{file}: no such file")
     folder = xml.with_name(f"{xml.stem}_files")
@@ -106,7 +104,7 @@ def kept(file: FilePath) -> Converted:
     Errors are those of :func:`convert`, which is asked for all cameras.
     """
     file = Path(file).absolute()
-    root = cache_folder("usd") or Path(tempfile.mkdtemp(prefix="envedit_usd_"))
+    root = cache_folder("usd") or Path(_scratch().name)
     key = json.dumps([str(file), _digests([str(file)]), _VERSION])
     folder = root / hashlib.sha256(key.encode()).hexdigest()[:32]
     xml = folder / f"{file.stem}.xml"
@@ -138,17 +136,17 @@ def kept(file: FilePath) -> Converted:
     return converted._replace(xml=xml)
 
 
+@functools.cache
+def _scratch():
+    """Return the folder of scenes where no caches are kept; it is gone when the process ends."""
+    return tempfile.TemporaryDirectory(prefix="envedit_usd_")
+
+
 def _digests(files):
     """Return the digest of each file, by its path; "" of one that cannot be read."""
     digests = {}
     for file in files:
         digests[file] = ""
-        with contextlib.suppress(OSError):
-            status = os.stat(file)
-            digests[file] = _digest(file, status.st_size, status.st_mtime_ns)
+        with contextlib.suppress(InputError):
+            digests[file] = atomic_files.known_digest(file).hex()
     return digests
-
-
-@functools.lru_cache(maxsize=1024)
-def _digest(path, size, changed):  # a run asks for the same scene several times
-    return atomic_files.digest(path).hex()

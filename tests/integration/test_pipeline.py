@@ -632,7 +632,8 @@ def test_what_is_only_tried_is_not_the_map_so_far(tmp_path, rng):
     """Ctrl-C while lights are tried, before and after there is a checkpoint, which stays as it is."""
     folder = tmp_path / "run"
     folder.mkdir()
-    settings = settings_of(tmp_path, sunny(rng), target={"rotate_degrees": 150.0})
+    tables = {"target": {"rotate_degrees": 150.0}, "representation": {"turn": False}}
+    settings = settings_of(tmp_path, sunny(rng), **tables)
     with pytest.raises(KeyboardInterrupt):
         pipeline.run(settings, folder=folder, watch=interrupting("searching for lights"))
     assert not list(folder.iterdir())

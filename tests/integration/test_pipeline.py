@@ -638,7 +638,7 @@ def test_what_is_only_tried_is_not_the_map_so_far(tmp_path, rng):
         pipeline.run(settings, folder=folder, watch=interrupting("searching for lights"))
     assert not list(folder.iterdir())
     with pytest.raises(pipeline.Interrupted):
-        pipeline.run(settings, folder=folder, watch=interrupting(step=1))
+        pipeline.run(settings, folder=folder, watch=interrupting())
     stored = (folder / checkpoint.NAME).read_bytes()
     with pytest.raises(KeyboardInterrupt):
         pipeline.run(settings, folder=folder, resume=True, watch=interrupting("searching for lights"))

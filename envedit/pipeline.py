@@ -30,9 +30,9 @@ from envedit.report import variants
 from envedit.representations.layers.layers import Layers
 from envedit.results import Result
 from envedit.scene.renderings import rendered
-from envedit.solve import adam_loop, adam_solver, feasibility, task
+from envedit.solve import adam_loop, adam_solver, feasibility
 from envedit.solve.edit_state import Interrupted, Stopped, Watch, keeping
-from envedit.solve.likelihood import SIGMA, sizes
+from envedit.solve.likelihood import SIGMA, Likelihood, sizes
 from envedit.targets import working_size
 from envedit.targets.target import Target
 from envedit.targets.target import make as make_target
@@ -344,7 +344,7 @@ class _Edit:
                 self.transport,
                 self.original,
                 target.picture,
-                task.likelihood(target),
+                Likelihood.of_target(target),
                 self.rows,
                 painted=target.coverage[..., 0],
                 rendered=target.initial,
@@ -451,7 +451,7 @@ class _Edit:
     def compare_photograph(self):
         """Set the camera of the metrics, and the pixels that the light does not explain."""
         photo, weight = self.target.photo, self.target.weight
-        likelihood = task.likelihood(self.target)
+        likelihood = Likelihood.of_target(self.target)
         residual = photo.missed(self.renders["edited"])
         of_rendering = 0.0 if self.noise is None else self.noise
         deviations = sizes(residual)[..., 0] / np.hypot(likelihood.noise(residual, SIGMA), of_rendering)

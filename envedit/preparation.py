@@ -155,10 +155,7 @@ class Preparation:
     @property
     def _started_before(self):
         """Whether a solution on disk is what Gauss-Newton steps go on from."""
-        optimizer = self.settings.optimizer
-        layers = self.settings.representation.kind == "layers"
-        stored = self.settings.renderer.kind == "transport"
-        return bool(optimizer.start) and optimizer.kind != "adam" and layers and stored
+        return bool(self.settings.optimizer.start) and self.settings.newton
 
     def _turn(self, target):
         """Return the turn that explains the target best; None where the sky is not to turn."""

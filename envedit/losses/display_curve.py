@@ -27,6 +27,11 @@ def to_display(radiance: mi.TensorXf, white: float = np.inf) -> mi.TensorXf:
     return mi.TensorXf(shown(radiance.array, opaque), radiance.shape)
 
 
+def values(radiance: ArrayLike, white: float = np.inf) -> np.ndarray:
+    """Return the display values of linear radiance (h, w, 3), float32, as of :func:`to_display`."""
+    return to_display(tensor(radiance), white).numpy()
+
+
 def shown(x: mi.Float, white: mi.Float) -> mi.Float:
     """Return the values of :func:`to_display` of plain arrays."""
     middle = dr.power(dr.clip(x, LOW, 1), 1 / 2.2)

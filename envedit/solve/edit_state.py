@@ -18,8 +18,9 @@ from envedit.renderers import Renderer
 from envedit.representations.layers.gain import LEVELS
 from envedit.representations.layers.unseen import unseen_kept
 from envedit.scene.scene import Scene
-from envedit.solve import block_jacobian, task
-from envedit.solve.map_problem import Problem
+from envedit.solve import block_jacobian, prior
+from envedit.solve.likelihood import SIGMA, Likelihood
+from envedit.solve.map_problem import Photographed, Problem
 from envedit.targets.target import Target
 from envedit.transport.light_transport import LightTransport
 
@@ -89,6 +90,12 @@ class EditState:
         """Whether the target is a rendering, and not painted."""
         return self.target.coverage is None
 
+    @property
+    def sigma(self) -> float:
+        """Standard error of display values: that of the target, at least :data:`.likelihood.SIGMA`."""
+        noise = self.target.noise
+        return SIGMA if noise is None else max(SIGMA, float(np.median(noise)))
+
     def decode(self, params: Params) -> np.ndarray:
         """Parameters to a whole map on the host, refusing what is not finite."""
         crop = self.representation.decode(params).numpy()
@@ -109,13 +116,21 @@ class EditState:
         if traced not in self._blocks:
             shape = self.original.shape[:2]
             self._blocks = {traced: block_jacobian.BlockJacobian(self.representation, traced, shape)}
-        return task.problem(
-            self.settings,
-            self.target,
+        target = self.target
+        expected = prior.Prior()
+        if not self.rendered:
+            expected = prior.of_paint(self.settings.solve.freedom, target.coverage)
+        return Problem(
             self.representation,
             traced,
             self.original,
-            self._blocks[traced],
+            target.aim,
+            Likelihood.of_target(target),
+            expected,
+            saturates=self.rendered,
+            blocks=self._blocks[traced],
+            photo=None if target.photo is None else Photographed.of(target.photo),
+            clipped=target.clipped,
         )
 
 

@@ -131,7 +131,8 @@ def solve(
         raise NumericalError("the initial map is not finite: check the input map for extreme values")
     if after_step and (known or not iterations):
         after_step(run, point)
-    point = _descended(problem, run, point, sigma, min(iterations, run.most), after_step)
+    left = min(iterations, run.most) - len(run.history)
+    point = descended(problem, run, point, sigma, left, after_step)
     normal = problem.curvature(point, run.start, sigma)
     note = ""
     whole = run
@@ -153,16 +154,19 @@ def solve(
     )
 
 
-def descended(problem: Problem, run: Run, point: Point, sigma: float = SIGMA, steps: int = 1) -> Point:
+def descended(
+    problem: Problem,
+    run: Run,
+    point: Point,
+    sigma: float = SIGMA,
+    steps: int = 1,
+    after_step: Callable[[Run, Point], None] | None = None,
+) -> Point:
     """Make at most some ``steps`` from where a run is, at ``point``, and return where they end.
 
     The run goes along; it may be finished before. Other parameters are those of :func:`solve`.
     """
-    return _descended(problem, run, point, sigma, len(run.history) + steps, None)
-
-
-def _descended(problem, run, point, sigma, most, after_step):
-    """Make steps until none lowers F, or there are ``most`` in all; returns where they end."""
+    most = len(run.history) + steps
     while len(run.history) < most and not run.finished:
         began = time.perf_counter()
 

@@ -13,13 +13,12 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from envedit.core.arrays import tensor
 from envedit.core.interrupts import ctrl_c
 from envedit.core.seeds import Seeds
 from envedit.core.types import Params
 from envedit.losses import display_curve
 from envedit.representations.layers.unseen import unseen_kept
-from envedit.solve import adam_loop, checkpoint, gauss_newton, hold, search, task, transport_error
+from envedit.solve import adam_loop, checkpoint, gauss_newton, hold, search, transport_error
 from envedit.solve.edit_state import EditState, Interrupted
 from envedit.solve.likelihood import SIGMA
 from envedit.solve.map_problem import Posterior
@@ -58,7 +57,7 @@ class LayersSolver:
             explanation = search.search(
                 problem,
                 problem.state(params),
-                self._sigma,
+                self.edit.sigma,
                 after_step,
                 most=edit.settings.optimizer.iterations if edit.newton else search.EXPLANATION_STEPS,
             )
@@ -77,27 +76,18 @@ class LayersSolver:
         NumericalError
             If they cannot begin.
         """
-        problem, rendered = self.edit.problem(transport), self.edit.rendered
+        problem = self.edit.problem(transport)
         problem.evaluate(begun.state)  # another explanation may have taken its columns of T
-        photographed = self.edit.target.photo is not None
-        solution = gauss_newton.solve(
-            problem,
-            params,
-            self._sigma,
-            run=begun,
-            sparing=rendered,
-            judge=self._display_error if rendered and not photographed else None,
-        )
-        if photographed:
-            self._take_off_camera(solution)
-        return solution.params
+        return self._steps(problem, params, begun, sparing=self.edit.rendered).params
 
     def settle(self, params: Params) -> float:
         """Go on from :attr:`begun` until no step and no light leads further; returns -2 log evidence."""
         most, problem = self.edit.settings.optimizer.iterations, self.edit.problem()
         problem.evaluate(self.begun.state)  # another edit may have taken its columns of T
         while self.begun is not None:
-            solution = gauss_newton.solve(problem, params, self._sigma, most, run=self.begun, sparing=False)
+            solution = gauss_newton.solve(
+                problem, params, self.edit.sigma, most, run=self.begun, sparing=False
+            )
             self.begun = self._another(solution)
         point = problem.evaluate(solution.run.state)  # what was tried since may have taken its columns
         self.begun = solution.run
@@ -107,7 +97,7 @@ class LayersSolver:
                 self.edit.scene, point.edited, settings.seed, settings.renderer.cache
             )
             point = replace(point, residual=problem.residual(point.state, shown))
-        return search.score(problem, solution.run, point, self._sigma)
+        return search.score(problem, solution.run, point, self.edit.sigma)
 
     def go_on_from(self, file: str, params: Params) -> None:
         """Let :meth:`optimise` go on from a solution on disk; InputError if it is not of these layers."""
@@ -144,32 +134,41 @@ class LayersSolver:
         with ctrl_c() as interrupt:
             keep = _Checkpoints(edit, digest, interrupt)
             while True:
-                photographed = edit.target.photo is not None
-                compared = edit.rendered and not (run and run.corrected)
-                solution = gauss_newton.solve(
+                # Paint is no noisy picture, and asks for what it shows.
+                sparing = edit.rendered and not (run and run.corrected)
+                solution = self._steps(
                     edit.problem(),
                     params,
-                    self._sigma,
-                    settings.iterations,
-                    keep.after_step,
                     run,
-                    sparing=compared,  # paint is no noisy picture, and asks for what it shows
-                    judge=self._display_error if compared and not photographed else None,
+                    sparing,
+                    iterations=settings.iterations,
+                    after_step=keep.after_step,
                 )
-                if photographed:
-                    self._take_off_camera(solution)
-                    following = self._settled(solution) or self._another(solution, interrupt)
-                    following = following or self._corrected(solution)
-                elif edit.rendered:
-                    following = self._another(solution, interrupt) or self._corrected(solution)
-                else:
-                    following = self._held_more(solution.run)
+                following = self._following(solution, interrupt)
                 if following is None:
                     break
                 run = following
         self.posterior = solution.posterior
         self.note = "; ".join(self._notes(solution))
         return solution.params, adam_loop.State(step=len(solution.history), history=solution.history)
+
+    def _steps(self, problem, params, run, sparing, **steps):
+        """Make steps; what those towards a photograph find of its camera is taken off the target."""
+        photographed = self.edit.target.photo is not None
+        judge = self._display_error if sparing and not photographed else None
+        solution = gauss_newton.solve(
+            problem, params, self.edit.sigma, run=run, sparing=sparing, judge=judge, **steps
+        )
+        if photographed:
+            self._take_off_camera(solution)
+        return solution
+
+    def _following(self, solution, interrupt):
+        """Return the run that goes on from a solution; None where it is the last."""
+        if not self.edit.rendered:
+            return self._held_more(solution.run)
+        settled = self._settled(solution) if self.edit.target.photo is not None else None
+        return settled or self._another(solution, interrupt) or self._corrected(solution)
 
     def _notes(self, solution):
         notes = [solution.note] if solution.note else list(self._likelier)
@@ -198,7 +197,7 @@ class LayersSolver:
             if interrupt and interrupt.is_set():
                 raise Interrupted(edit.decode(solution.params), len(run.history))
 
-        likelier = search.further(edit.problem(), run, self._sigma, after_step)
+        likelier = search.further(edit.problem(), run, self.edit.sigma, after_step)
         if likelier is None:
             return None
         self._likelier.append(f"then likelier: {likelier.name} (-2 log evidence {likelier.score:.1f})")
@@ -254,7 +253,7 @@ class LayersSolver:
             point = problem.evaluate(one.state)
             if point.residual is None:
                 continue
-            point = gauss_newton.descended(problem, one, point, self._sigma, search.EXPLANATION_STEPS)
+            point = gauss_newton.descended(problem, one, point, self.edit.sigma, search.EXPLANATION_STEPS)
             seen = edit.target.photo.exposed_by(one.state["camera"][0])
             unlikeliness = problem.likelihood.at_best(seen.missed(point.rendering), SIGMA)
             tried.append((unlikeliness + problem.penalty(one.state, one.start), seen, one))
@@ -298,16 +297,12 @@ class LayersSolver:
 
     # ---- What T has no part in -----------------------------------------------------------------------------
 
-    @property
-    def _sigma(self):
-        return task.sigma(self.edit.target)
-
     def _display_error(self, envmap):
         """Return the mean square of display values of Mitsuba's rendering of a map less the target's."""
         target = self.edit.target
         seed = Seeds.of(self.edit.settings.seed).step_check
-        shown = display_curve.to_display(tensor(self.edit.scene.render(envmap, transport_error.SPP, seed)))
-        missed = shown.numpy() - display_curve.to_display(tensor(target.picture)).numpy()
+        shown = display_curve.values(self.edit.scene.render(envmap, transport_error.SPP, seed))
+        missed = shown - display_curve.values(target.picture)
         weight = 1 if target.known_weight is None else target.known_weight
         return float((np.square(missed) * weight).mean())
 

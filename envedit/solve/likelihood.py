@@ -27,9 +27,9 @@ from typing import Any
 
 import numpy as np
 
-from envedit.core.arrays import tensor
 from envedit.core.color import brightest_shown
 from envedit.losses import display_curve
+from envedit.targets.target import Target
 
 SIGMA = 0.005
 """Standard error of display values that a pixel is known to, where it was not measured. Measured: with twice
@@ -81,6 +81,13 @@ class Likelihood:
             rest=rest if rest.any() else None,
             white=white,
         )
+
+    @classmethod
+    def of_target(cls, target: Target) -> Likelihood:
+        """Return that of a target's residuals: of a rendering, or of paint where it has coverage."""
+        if target.coverage is None:
+            return cls(on_average_one(target.weight, target.picture.shape[:2]))
+        return cls.of_paint(target.weight, target.coverage, target.initial, target.picture)
 
     @property
     def robust(self) -> bool:
@@ -162,8 +169,7 @@ class Likelihood:
 
 def _painted_change(weight, initial, picture, white):
     """Return the root mean square change of display values, where it is visible; at least what is."""
-    both = (tensor(np.float32(one)) for one in (initial, picture))
-    shown = (display_curve.to_display(one, white).numpy() for one in both)
+    shown = (display_curve.values(np.float32(one), white) for one in (initial, picture))
     size = sizes(np.subtract(*shown, dtype=np.float64))
     weight = np.where(size > VISIBLE, weight, 0)
     total = weight.sum()

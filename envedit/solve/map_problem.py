@@ -38,6 +38,7 @@ from envedit.solve.likelihood import Likelihood, on_average_one
 from envedit.solve.normal_equations import Blocks, MeanOfRest, Normal, solved
 from envedit.solve.prior import AXES, Prior
 from envedit.solve.unknowns import LOG_SATURATIONS, Point, Unknowns, in_numpy
+from envedit.targets.photo import Photo
 from envedit.transport.light_transport import COLUMNS_A_LOOK, LightTransport
 
 LARGEST_STEP = {
@@ -58,6 +59,11 @@ class Photographed:
     # (3,), exposure and white balance by which the target has been divided, less what they are drawn to
     log_factor: np.ndarray
     precision: np.ndarray  # (3, 3), inverse covariance of their sum, about 0
+
+    @classmethod
+    def of(cls, photo: Photo) -> Photographed:
+        """Return what a photograph adds."""
+        return cls(photo.camera.log_factor - photo.centre, photo.precision)
 
 
 @dataclass(frozen=True)
@@ -135,7 +141,7 @@ class Problem(Unknowns):
     def _aim(self, picture, likelihood):
         self.picture = picture
         self.likelihood = likelihood or Likelihood(on_average_one(None, picture.shape[:2]))
-        self.target = display_curve.to_display(tensor(picture), self.likelihood.white).numpy()
+        self.target = display_curve.values(picture, self.likelihood.white)
 
     def aimed_at(self, picture: np.ndarray, likelihood: Likelihood | None, point: Point) -> Point:
         """Take another target, with its likelihood; returns a point with its residual from that target."""
@@ -162,8 +168,7 @@ class Problem(Unknowns):
 
     def residual(self, state: dict, rendering: np.ndarray) -> np.ndarray:
         """Return display values of a rendering (h, w, 3), under a camera's factor, less the target's."""
-        exposed = tensor(rendering * self._exposure(state))
-        shown = display_curve.to_display(exposed, self.likelihood.white).numpy()
+        shown = display_curve.values(rendering * self._exposure(state), self.likelihood.white)
         residual = np.float64(shown) - self.target
         if self.clipped is None:
             return residual

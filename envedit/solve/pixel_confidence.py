@@ -9,9 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from envedit.core.arrays import tensor
 from envedit.core.types import Views
-from envedit.losses.display_curve import to_display
+from envedit.losses import display_curve
 from envedit.solve.likelihood import SIGMA
 
 AVERAGED_PIXELS = 2
@@ -56,7 +55,7 @@ def weights(
         :data:`LIGHT_BRIGHTNESS`; medians are over pixels that are :data:`LEAST_BRIGHTNESS`. None where no
         pixel is below 1/2, or none that is lit is above 0.
     """
-    shown = [to_display(tensor(p)).numpy() for p in (first, second)]
+    shown = [display_curve.values(p) for p in (first, second)]
     variance = np.square(shown[0].astype(np.float64) - shown[1]).mean(axis=2) * share / (1 + share)
     if noise is not None:
         variance += np.square(noise)

@@ -162,20 +162,20 @@ def _neighbours(problem, best, moves, sigma, after_step, steps, sky):
     return neighbours
 
 
-def of_place(problem: Problem) -> float:
+def _cost_of_place(problem: Problem) -> float:
     """Return what a light's place costs that was looked for: of a rendering it could be in any cell."""
     _, directions = problem.blocks.sky
     return 2 * np.log(max(len(directions), 1)) * problem.likelihood.robust
 
 
-def of_choice(problem: Problem) -> float:
+def _cost_of_choice(problem: Problem) -> float:
     """Return what it costs that a light of the map shines elsewhere: it could be any of them."""
     return 2 * np.log(max(problem.layers.lights.own, 1))
 
 
-def of_light(problem: Problem) -> float:
+def _cost_of_light(problem: Problem) -> float:
     """Return what an added light costs."""
-    return ADDED_LIGHT_COST + of_place(problem)
+    return ADDED_LIGHT_COST + _cost_of_place(problem)
 
 
 def score(problem: Problem, run: gauss_newton.Run, point: Point, sigma: float) -> float:
@@ -187,8 +187,8 @@ def score(problem: Problem, run: gauss_newton.Run, point: Point, sigma: float) -
     _, posterior = np.linalg.slogdet(normal.hessian)
     _, prior = np.linalg.slogdet(normal.precision)
     # ---- What lights cost
-    cost = of_light(problem) * len(problem.added(run.state))
-    cost += (of_choice(problem) + of_place(problem)) * len(_replaced(problem, run))
+    cost = _cost_of_light(problem) * len(problem.added(run.state))
+    cost += (_cost_of_choice(problem) + _cost_of_place(problem)) * len(_replaced(problem, run))
     if problem.likelihood.robust:
         cost += FADED_LIGHT_COST * len(_faded(problem, run.state))
     evidence = float(problem.unlikeliness(point, run.start, sigma) + posterior - prior + cost)
@@ -251,7 +251,7 @@ def _beside_the_sky(problem, best, sigma):
         # With the columns of T that the dark sky was rendered with.
         stays = places.fall(problem.evaluate(state, resolve=False).rendering)
         # ---- out
-        worth = ADDED_LIGHT_COST if own else of_light(problem)
+        worth = ADDED_LIGHT_COST if own else _cost_of_light(problem)
         if k in _faded(problem, state):
             worth = FADED_LIGHT_COST
         yield _Move(k, REMOVED, dark, start, gain=worth - stays)
@@ -290,30 +290,22 @@ def _places(problem, state, start, sigma):
 def _under_the_original(problem, best, sigma):
     """Yield moves that raise the likelihood under the gain of the original, all else as it is."""
     state = best.run.state | {name: np.zeros_like(best.run.state[name]) for name in ("gain", "saturation")}
-    now = _unlikeliness(problem, state, sigma)
-    for k, what, changed, centre, unlikeliness, cost in _changes(problem, state, best.run.start, sigma):
-        yield _Move(k, what, changed, centre, gain=now - unlikeliness - cost)
-
-
-def _changes(problem, state, start, sigma):
-    """Yield what can be done to the lights: (int, str, dict, dict, float, float).
-
-    Which light, what, state, centre of the prior, -2 log likelihood, and what it costs to add the light.
-    """
+    start = best.run.start
     lights = problem.layers.lights
     spare = [k for k in range(lights.own, lights.count) if k not in problem.added(state)]
+    now = _unlikeliness(problem, state, sigma)
 
     for k in problem.shining(state):
         own = k < lights.own
         dark = with_light(state, k, flux=DARK)
         # ---- elsewhere
         away = problem.direction(state, k)
-        cost = of_choice(problem) if own and not start["turn"][k].any() else 0.0
+        cost = _cost_of_choice(problem) if own and not start["turn"][k].any() else 0.0
         for there in painted_places.best(problem, dark, k, sigma, away):
             placed = _placed(lights, k, there)
-            centre = {"turn": placed["turn"]} if own else placed
             moved = with_light(state, k, **placed)
-            yield k, MOVED, moved, with_light(start, k, **centre), there.unlikeliness, cost
+            centre = with_light(start, k, **({"turn": placed["turn"]} if own else placed))
+            yield _Move(k, MOVED, moved, centre, gain=now - there.unlikeliness - cost)
         # ---- softer: a light of few texels cannot grow, as its texels would part; a lobe can
         if own and spare:
             flux = state["flux"][k] + log_flux_of(lights.flux[k] / lights.flux[spare[0]])
@@ -321,17 +313,18 @@ def _changes(problem, state, start, sigma):
             size = lights.log_size(painted_places.LARGER_DEGREES[0])
             soft = with_light(dark, spare[0], turn=turn, flux=flux, size=size)
             centre = with_light(start, spare[0], turn=turn, flux=flux, size=size)
-            yield k, SOFTENED, soft, centre, _unlikeliness(problem, soft, sigma), 0.0
+            yield _Move(k, SOFTENED, soft, centre, gain=now - _unlikeliness(problem, soft, sigma))
         # ---- out, if it was added
         if not own:
-            yield k, REMOVED, dark, start, _unlikeliness(problem, dark, sigma), -ADDED_LIGHT_COST
+            gain = now - _unlikeliness(problem, dark, sigma) + ADDED_LIGHT_COST
+            yield _Move(k, REMOVED, dark, start, gain)
 
     # ---- one more, as large as it must be
     for k in spare[:1]:
         for there in painted_places.best(problem, state, k, sigma):
             placed = _placed(lights, k, there)
             more, centre = (with_light(one, k, **placed) for one in (state, start))
-            yield k, ADDED, more, centre, there.unlikeliness, ADDED_LIGHT_COST
+            yield _Move(k, ADDED, more, centre, gain=now - there.unlikeliness - ADDED_LIGHT_COST)
 
 
 def _placed(lights, k, there):

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from envedit.core import latlong
-from envedit.core.arrays import tensor
 from envedit.losses import display_curve
 from envedit.transport.light_transport import LightTransport
 
@@ -142,7 +141,7 @@ def residuals(rendering: np.ndarray, picture: np.ndarray) -> np.ndarray:
 
 def display_values(picture: np.ndarray) -> np.ndarray:
     """Return display values of a picture (h, w, 3), linear radiance, as float64."""
-    return display_curve.to_display(tensor(picture)).numpy().astype(np.float64)
+    return display_curve.values(picture).astype(np.float64)
 
 
 def _at_a_glance(transport, envmap, picture, weight, rendering):
@@ -153,9 +152,7 @@ def _at_a_glance(transport, envmap, picture, weight, rendering):
     count = np.ones((*picture.shape[:2], 1)) if weight is None else np.float64(weight)
     overview = transport.overview()
     height, width, _ = envmap.shape
-    target, own = (
-        overview.to_blocks(display_curve.to_display(tensor(one)).numpy()) for one in (picture, rendering)
-    )
+    target, own = (overview.to_blocks(display_curve.values(one)) for one in (picture, rendering))
     share = overview.to_blocks(count)
     lamps = overview.to_blocks(transport.other_light())
     omega = np.repeat(latlong.lookup_solid_angles(height, width), width).reshape(height, width)
@@ -174,7 +171,7 @@ def _at_a_glance(transport, envmap, picture, weight, rendering):
         turned = np.stack([np.add.reduceat(np.roll(band[..., c], -k, 1), starts, 1) for k in range(width)], 2)
         means = turned.reshape(cells, width) / total[:, None]
         blocks = overview.matrix[c] @ means.astype(np.float32) + lamps[:, c : c + 1]
-        shown = display_curve.to_display(tensor(blocks)).numpy()
+        shown = display_curve.values(blocks)
         result += (share * np.square(shown - target[:, c : c + 1])).sum(axis=0)
         least += float((share[:, 0] * np.square(shown[:, 0] - own[:, c])).sum())
     return np.where(np.isfinite(result), result, np.inf), least

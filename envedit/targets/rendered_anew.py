@@ -13,9 +13,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from envedit.core.arrays import tensor
 from envedit.core.types import Views
-from envedit.losses.display_curve import to_display
+from envedit.losses import display_curve
 
 CHANGED = 0.9
 """Share of the pixels that differ from the initial rendering from which on a picture may be rendered anew."""
@@ -76,7 +75,7 @@ def samples(
 
 def high_pass(picture: np.ndarray, views: Views = (slice(None),)) -> np.ndarray:
     """Return display values (h, w, 3) without what is smooth in them, view by view."""
-    shown = to_display(tensor(picture)).numpy().astype(np.float64)
+    shown = display_curve.values(picture).astype(np.float64)
     parts = []
     for rows in views:
         padded = np.pad(shown[rows], ((1, 1), (1, 1), (0, 0)), mode="edge")

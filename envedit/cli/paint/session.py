@@ -489,7 +489,7 @@ class Session:
         if not self._dragged:
             solution = self.solution
             both, white = (solution.target, solution.point.rendering), solution.problem.likelihood.white
-            target, reached = (display_curve.to_display(tensor(one), white).numpy() for one in both)
+            target, reached = (display_curve.values(one, white) for one in both)
             self.tell.frame("difference", source, target - reached, self.scene.rows)
 
     def sky(self) -> None:

@@ -273,7 +273,7 @@ class _Edit:
         self.warnings += config.unused(self.settings, None if no_step else solver)
         with self.clock("edit_s"), self._carrying():
             self.watch.stage("editing")
-            self.params, self.state = self.job.optimise(self.start.params, self.start.crop, resume)
+            self.params, self.state = self.start.optimise(resume)
             self.solved_map = self.job.decode(self.params)
         photo = self.target.photo
         if self.small is self.scene:
@@ -390,10 +390,10 @@ class _Edit:
 
     def render_variants(self):
         """Render the other explanations of paint."""
-        for explanation in self.job.layers.others if self.job else ():
+        for explanation in self.start.layers.others if self.job else ():
             with self.clock("judge_s"), self._carrying(self.edited):
                 self.watch.stage("rendering other explanations")
-                changed, _ = self._adjusted(self.job.layers.map_of(explanation))
+                changed, _ = self._adjusted(self.start.layers.map_of(explanation))
                 stored = self.map.as_stored(changed, self.degrees)
                 tonemap = self.settings.output.tonemap
                 self.others.append(
@@ -549,8 +549,8 @@ class _Edit:
         """Return what the run has found."""
         # ---- What is said of the edit
         job, notes = self.job, self.notes
-        if job and job.layers.note:
-            notes.append(job.layers.note)
+        if job and self.start.layers.note:
+            notes.append(self.start.layers.note)
         if self.others:
             notes.append(f"other explanations: {', '.join(one.summary for one in self.others)}")
         if lights := light_list.summary(self.lights, len(self.original)):
@@ -595,7 +595,7 @@ class _Edit:
             given=self.map,
             alpha=self.scene.alpha,
             found=found,
-            posterior=job.layers.posterior if job else None,
+            posterior=self.start.layers.posterior if job else None,
             photo=self.target.photo,
             outliers=self.outliers,
             variants=self.others,

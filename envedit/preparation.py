@@ -10,7 +10,6 @@ import math
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -44,36 +43,27 @@ TURN_PATHS = 2**20
 as many as the target's."""
 
 
-@dataclass
-class Job(EditState):
-    """One edit in progress, with its two solvers: Gauss-Newton for layers through T, Adam for all else."""
-
-    @cached_property
-    def layers(self) -> LayersSolver:
-        """Solver of layers; also finds where Adam starts, if their detail is left to it."""
-        return LayersSolver(self)
-
-    def optimise(self, params: Params, crop: np.ndarray, resume: bool) -> tuple[Params, adam_loop.State]:
-        """Optimise from the start, or from the checkpoint; returns parameters and state.
-
-        Parameters and errors are those of :func:`.adam_solver.optimise` and :meth:`.LayersSolver.optimise`.
-        """
-        if self.newton:
-            return self.layers.optimise(params, resume)
-        return adam_solver.optimise(self, params, crop, resume)
-
-
 @dataclass(frozen=True)
 class Edit:
     """An edit that is ready to be optimised."""
 
-    job: Job  # has the map, turned, as its original
+    job: EditState  # has the map, turned, as its original
+    layers: LayersSolver  # solver of layers; finds where Adam starts, if their detail is left to it
     params: dict  # where it starts
-    crop: np.ndarray  # (rows, W, 3), active rows of that map
     degrees: float  # by how much it has been turned
     # bool (H, W), active texels that keep their value; None where the renderer does not know
     frozen: np.ndarray | None
     notes: list[str]  # what was chosen
+
+    def optimise(self, resume: bool) -> tuple[Params, adam_loop.State]:
+        """Optimise from the start, or from the checkpoint; returns parameters and state.
+
+        By Gauss-Newton for layers through T, by Adam for all else; errors are those of
+        :func:`.adam_solver.optimise` and :meth:`.LayersSolver.optimise`.
+        """
+        if self.job.newton:
+            return self.layers.optimise(self.params, resume)
+        return adam_solver.optimise(self.job, self.params, resume)
 
 
 @dataclass
@@ -119,7 +109,7 @@ class Preparation:
         """
         if self._started_before:
             edit = self._prepared(target, 0.0, [], search=False)
-            edit.job.layers.go_on_from(self.settings.optimizer.start, edit.params)
+            edit.layers.go_on_from(self.settings.optimizer.start, edit.params)
             return edit
         # ---- Maps that explain the target to its noise are taken as they are
         if self._explains(self.original, target):
@@ -138,12 +128,12 @@ class Preparation:
         if not always and turn.left >= turning.EXPLAINED:
             return self._prepared(target, 0.0, [])
         turned = self._prepared(target, turn.degrees, [note])
-        if always or turned.job.layers.begun is None:
+        if always or turned.layers.begun is None:
             return turned
         still = self._prepared(target, 0.0, [])
         with self.clock("start_s"):
             self.watch.stage("comparing the edits of the turned and of the unturned sky")
-            score, other = (one.job.layers.settle(one.params) for one in (turned, still))
+            score, other = (one.layers.settle(one.params) for one in (turned, still))
         # As many turns as the map has columns could have been the best one.
         score += 2 * np.log(self.original.shape[1])
         chosen = still if other < score - STRONG_EVIDENCE else turned
@@ -230,11 +220,11 @@ class Preparation:
         with self.clock("transport_s"):
             recordings = self._recorded(representation, target) if search else None
         octaves = recordings.octaves if recordings else []
-        job = Job(
+        job = EditState(
             settings=settings,
             scene=self.scene,
             original=original,
-            first=self.rows.first,
+            rows=self.rows,
             free=None,
             target=target,
             representation=representation,
@@ -243,22 +233,15 @@ class Preparation:
             watch=self.watch,
             dists=self.dists,
         )
+        layers = LayersSolver(job)
 
         # ---- Which lights, and where; which pixels count, and whether coarse grids are not enough
         if recordings and (settings.optimizer.iterations or not job.newton):
             with self.clock("start_s"):
-                params, run = self._explained(job, params, octaves, notes, recordings.transport)
-            if octaves:
-                envmap = original.copy()
-                envmap[representation.active] = representation.decode(params).numpy()
-                if self._explains(envmap, target):
-                    notes.append("coarse grids explain the target to its noise: no finer ones are solved for")
-                    octaves = []
-                else:
-                    job.target, more = initialization.trusted(envmap, recordings, job.target)
-                    notes += more
+                params, run = self._explained(layers, params, octaves, notes, recordings.transport)
+            octaves = octaves and self._finer(job, params, recordings, notes)
             if job.newton and not octaves:
-                job.layers.begun = run
+                layers.begun = run
 
         # ---- Which texels keep their value
         frozen = self._frozen(determined=bool(octaves) or not job.newton)
@@ -281,7 +264,18 @@ class Preparation:
         if octaves:
             job.representation = representation.refined(octaves)
             params = job.representation.start() | params
-        return Edit(job, params, crop, degrees, frozen, notes)
+        return Edit(job, layers, params, degrees, frozen, notes)
+
+    def _finer(self, job, params, recordings, notes):
+        """Return the octaves of finer grids that are needed; pixels that do not count for them weigh less."""
+        envmap = job.original.copy()
+        envmap[job.rows.slice] = job.representation.decode(params).numpy()
+        if self._explains(envmap, job.target):
+            notes.append("coarse grids explain the target to its noise: no finer ones are solved for")
+            return []
+        job.target, more = initialization.trusted(envmap, recordings, job.target)
+        notes += more
+        return recordings.octaves
 
     def _frozen(self, determined: bool) -> np.ndarray | None:
         """Return which texels keep their value, (H, W); None where no transport is stored.
@@ -328,18 +322,18 @@ class Preparation:
             None if self.kept is None else self.kept[self.rows.slice],
         )
 
-    def _explained(self, job, params, octaves, notes, transport):
+    def _explained(self, layers, params, octaves, notes, transport):
         """Find the lights that explain the target, and for Adam the sky; returns parameters and the run."""
         self.watch.stage("searching for lights")
-        explanation = job.layers.explain(params, transport)
-        subject = "the target" if job.rendered else "the paint"
+        explanation = layers.explain(params, transport)
+        subject = "the target" if layers.edit.rendered else "the paint"
         evidence = f"-2 log evidence {explanation.score:.1f}"
         notes.append(f"likeliest explanation of {subject}: {explanation.name} ({evidence})")
-        if job.newton and not octaves:
+        if layers.edit.newton and not octaves:
             return params, explanation.run
         self.watch.stage("solving for lights and coarse gain")
         try:
-            solved = job.layers.solved(params, explanation.run, transport)
+            solved = layers.solved(params, explanation.run, transport)
         except NumericalError:  # a start that goes nowhere is no reason to stop
             return params, explanation.run
         # What ground is lit by from elsewhere makes up for what coarse grids cannot show.

@@ -20,13 +20,10 @@ quickstart, four representations at rates of 0.1 to 1e38: it is 0.02 to 1.7, or 
 1e6 times the first."""
 
 
-def optimise(
-    edit: EditState, params: Params, crop: np.ndarray, resume: bool
-) -> tuple[Params, adam_loop.State]:
+def optimise(edit: EditState, params: Params, resume: bool) -> tuple[Params, adam_loop.State]:
     """Optimise from the start, or from the checkpoint where there is one and ``resume`` asks for it.
 
-    ``params`` is where to start, ``crop`` (rows, W, 3) the active rows of the original. A resumed run takes
-    its target's picture from the checkpoint.
+    ``params`` is where to start. A resumed run takes its target's picture from the checkpoint.
 
     Raises
     ------
@@ -50,7 +47,7 @@ def optimise(
         edit.settings.loss,
         edit.target.aim,
         edit.target.known_weight,
-        crop,
+        edit.crop,
         settings.iterations,
         dists=edit.dists,
         every=edit.settings.perceptual.dists_every,
@@ -81,7 +78,7 @@ def optimise(
                 edit.renderer,
                 objective,
                 edit.original,
-                edit.first,
+                edit.rows.first,
                 settings,
                 free=edit.free,
                 adam=adam,
@@ -89,7 +86,7 @@ def optimise(
                 after_step=after_step,
             )
             _look_at_the_last(edit, adam, state)
-            if error := _ran_away(edit, objective, params, adam.params, len(crop), state.bad_steps):
+            if error := _ran_away(edit, objective, params, adam.params, state.bad_steps):
                 raise Stopped(error, edit.decode(params))
         except NumericalError as error:
             if isinstance(error, Stopped):
@@ -124,7 +121,7 @@ def _look_at_the_last(edit, adam, state):
         edit.decode(adam.params)
 
 
-def _ran_away(edit, objective, start, params, rows, bad_steps):
+def _ran_away(edit, objective, start, params, bad_steps):
     """Say that a rate that a user has raised led nowhere: the loss has risen, or most steps were bad.
 
     Both are weighed as in the last step, through the same samples.
@@ -132,7 +129,7 @@ def _ran_away(edit, objective, start, params, rows, bad_steps):
     settings = edit.settings.optimizer
     if not (settings.iterations and raised_rate(edit)):
         return ""
-    before, after = (_loss(edit, objective, one, rows, settings.iterations - 1) for one in (start, params))
+    before, after = (_loss(edit, objective, one, settings.iterations - 1) for one in (start, params))
     stuck = 2 * bad_steps >= settings.iterations and not after < before
     if after <= MOST_RISEN_LOSS * before and not stuck:
         return ""
@@ -143,8 +140,8 @@ def _ran_away(edit, objective, start, params, rows, bad_steps):
     )
 
 
-def _loss(edit, objective, params, rows, step):
+def _loss(edit, objective, params, step):
     edited = edit.decode(params)
     rendering = edit.renderer.render(tensor(edited), step)
-    total, _ = objective(rendering, tensor(edited[edit.first : edit.first + rows]), step)
+    total, _ = objective(rendering, tensor(edited[edit.rows.slice]), step)
     return float(total[0])

@@ -12,6 +12,7 @@ import numpy as np
 
 from envedit import config
 from envedit.core.errors import NumericalError, place_of
+from envedit.core.rows import Rows
 from envedit.core.types import Params
 from envedit.losses.perceptual import distances
 from envedit.renderers import Renderer
@@ -66,7 +67,7 @@ class EditState:
     settings: config.Config  # what is carried out
     scene: Scene  # what is lit
     original: np.ndarray  # (H, W, 3), the map
-    first: int  # its first active row
+    rows: Rows  # its active rows
     free: np.ndarray | None  # bool (rows, W), active texels that may change; None: all
     # What the renderer is to make; solvers may change its weights and what it is compared with
     target: Target
@@ -86,6 +87,11 @@ class EditState:
         return self.settings.optimizer.kind != "adam" and len(self.representation.gain.sizes) == LEVELS
 
     @property
+    def crop(self) -> np.ndarray:
+        """The active rows of the map, (rows, W, 3)."""
+        return self.original[self.rows.slice]
+
+    @property
     def rendered(self) -> bool:
         """Whether the target is a rendering, and not painted."""
         return self.target.coverage is None
@@ -99,15 +105,14 @@ class EditState:
     def decode(self, params: Params) -> np.ndarray:
         """Parameters to a whole map on the host, refusing what is not finite."""
         crop = self.representation.decode(params).numpy()
-        rows = slice(self.first, self.first + crop.shape[0])
         if self.free is not None:
-            crop = np.where(self.free[..., None], crop, self.original[rows])
+            crop = np.where(self.free[..., None], crop, self.crop)
         if (bad := ~np.isfinite(crop)).any():
-            where = place_of(bad, self.first)
+            where = place_of(bad, self.rows.first)
             remedy = "scale the map down" if self.newton else "lower [optimizer] lr"
             raise NumericalError(f"the edited map is not finite at {where}: {remedy}")
         edited = self.original.copy()
-        edited[rows] = crop
+        edited[self.rows.slice] = crop
         return unseen_kept(self.original, edited) if self.representation.models_edit else edited
 
     def problem(self, transport: LightTransport | None = None) -> Problem:

@@ -19,9 +19,6 @@ def test_the_file_loads_to_the_defaults_that_it_spells_out(here, capsys):
     written = config.load("edit.toml")
     assert written == config.from_dict({"target": {"rotate_degrees": 60}}, here, "edit.toml")
     assert written.target.degrees == config.Target().degrees
-    assert set(tomllib.loads((here / "edit.toml").read_text())) == {
-        "preset", "input", "scene", "target", "representation",
-    }  # fmt: skip
 
 
 @pytest.mark.parametrize("name", shipped.scenes())
@@ -41,11 +38,8 @@ def test_paths_are_relative_to_the_file_that_is_written(here):
     assert str(here) not in text
     assert tomllib.loads(text)["input"]["envmap"] == "../../maps/a sky.hdr"
     settings = config.load("jobs/first/edit.toml")
-    for path, file in (
-        (settings.input.envmap, "maps/a sky.hdr"),
-        (settings.scene.file, "scenes/mine.xml"),
-    ):
-        assert (here / file).samefile(path)
+    assert (here / "maps/a sky.hdr").samefile(settings.input.envmap)
+    assert (here / "scenes/mine.xml").samefile(settings.scene.file)
 
 
 @pytest.mark.parametrize("kind", ["file", "folder", "dangling link"])

@@ -14,7 +14,7 @@ from envedit.config import light_schema, stroke_schema
 from envedit.config.json_schema import json_schema
 from envedit.config.reference import markdown
 from envedit.config.schema import FIELDS, TOP
-from envedit.config.validators import Check, Choice, Integer, Number, WantedError
+from envedit.config.validators import Choice, Integer, Number, WantedError
 from envedit.core import shipped
 from envedit.core.errors import ConfigError
 from tests.oracles import ROOT
@@ -106,15 +106,6 @@ def test_the_schema_refuses_what_a_configuration_refuses(table):
         config.from_dict(table)
 
 
-def test_checks_can_be_inspected():
-    assert FIELDS["input"]["width"].metadata["check"] == Integer(6, 16384, even=True)
-    assert FIELDS["target"]["kind"].metadata["check"].names == (
-        "envmap", "rendering", "photo", "image", "strokes", "none",
-    )  # fmt: skip
-    for check in CHECKS.values():
-        assert isinstance(check, Check) and check.kind and str(check) and "object at" not in repr(check)
-
-
 # ---- the page of all keys ----------------------------------------------------------------------------------
 
 
@@ -128,12 +119,6 @@ def test_the_page_is_what_is_generated(capsys):
     assert set(light_schema.MEANINGS) == {*light_schema.OWN, *light_schema.ADDED}
     assert set(stroke_schema.MEANINGS) == set(stroke_schema.stroke_keys())
     assert command.main([]) == 0 and json.loads(capsys.readouterr().out) == SCHEMA
-
-
-def test_the_page_has_each_preset_s_default():
-    rows = {line.split(" | ")[0][2:]: line.split(" | ") for line in markdown().splitlines() if "| `" in line}
-    assert rows["`epochs`"][2:6] == ["steps", "`500`", "`1200`", "`1500`"]
-    assert rows["`hidden`"][3:6] == ["`64`", "`128`", "`256`"]
 
 
 # ---- keys that change nothing ------------------------------------------------------------------------------

@@ -24,33 +24,14 @@ KINDS = ("layers", "siren", "pixels", "log-pixels")
 
 def test_an_empty_file_gives_the_defaults():
     config = cfg.loads("")
-    assert config.preset == "standard" and config.seed == 0 and config.variant == "llvm_ad_rgb"
-    assert config == dataclasses.replace(cfg.Config(), output=config.output)
-    assert config.input == cfg.Input(envmap="auto", width=256, rows="all")
-    assert config.fit.lr == 1e-3 and config.renderer.spp == "auto"
-    assert config.representation.kind == "layers" and config.representation.cycles == "auto"
-    assert config.loss.ssim == 0.1 and config.optimizer.iterations == 100
-    assert config.optimizer.lr == "auto" and cfg.loads("[optimizer]\nlr = 1e-3").optimizer.lr == 1e-3
-
-
-def test_every_key_says_what_it_means():
-    for f in dataclasses.fields(cfg.Fit):
-        assert f.metadata["doc"] and f"{f.name} : " in cfg.Fit.__doc__
-    assert "turbidity : float" in cfg.Input.__doc__ and "variant : str" in cfg.Config.__doc__
-
-
-@pytest.mark.parametrize("solver", ["auto", "gauss-newton", "adam"])
-def test_layers_through_a_transport_take_every_solver(solver):
-    assert cfg.loads("").optimizer.kind == "auto"
-    config = cfg.loads(f'[optimizer]\nkind = "{solver}"')
-    assert config.optimizer.kind == solver
-    assert cfg.loads(cfg.to_toml(config)).optimizer.kind == solver
+    assert config.preset == "standard" and config == dataclasses.replace(cfg.Config(), output=config.output)
 
 
 @pytest.mark.parametrize(
     "tables", [f"[representation]\nkind = '{kind}'" for kind in KINDS[1:]] + ["[renderer]\nkind = 'path'"]
 )
 def test_gauss_newton_without_layers_or_a_transport_is_refused(tables):
+    assert cfg.loads("[optimizer]\nkind = 'gauss-newton'").optimizer.kind == "gauss-newton"
     message = refused(tables + "\n[optimizer]\nkind = 'gauss-newton'")
     assert "optimizer.kind" in message and "expected adam or auto" in message
     for solver in ("auto", "adam"):
@@ -143,10 +124,8 @@ def test_keys_of_many_parts_are_refused_before_they_are_parsed():
     assert "did you mean" in refused("", f"input.envmp={{ {parts}a = 1 }}")  # not parsed: a string
     points = "[0.1, 0.25], " * 2000 + "[1.0, 1.0]"
     stroke = f"{{ type = 'light', points = [{points}], width = 0.1 }}"
-    assert (
-        len(cfg.loads(f"[target]\nkind = 'strokes'\nstrokes = [{stroke}]").target.strokes[0]["points"])
-        == 2001
-    )
+    found = cfg.loads(f"[target]\nkind = 'strokes'\nstrokes = [{stroke}]").target.strokes
+    assert len(found[0]["points"]) == 2001
     assert cfg.loads(f"# {'a word. ' * 300}\n[input]\nenvmap = 'a.b.c/../..' # {'.' * 500}").input.envmap
 
 
@@ -295,9 +274,6 @@ def test_junk_overrides_raise_nothing_but_config_errors(overrides):
     only_config_errors(lambda: cfg.loads("", overrides=overrides))
 
 
-@pytest.mark.parametrize(
-    "text", ['vgg = "a.npz"', 'dists = "a.npz"', 'backbone = "a.npz"', 'heads = "a.npz"']
-)
-def test_perceptual_weights_come_in_pairs(text):
-    with pytest.raises(ConfigError, match="expected both or none"):
-        cfg.loads(f"[perceptual]\n{text}")
+@pytest.mark.parametrize("key", ["vgg", "dists", "backbone", "heads"])
+def test_perceptual_weights_come_in_pairs(key):
+    assert "expected both or none" in refused(f"[perceptual]\n{key} = 'a.npz'")

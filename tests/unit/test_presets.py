@@ -45,8 +45,7 @@ def test_default_then_preset_then_file_then_override():
     assert cfg.loads('preset = "draft"\n[fit]\nepochs = 7', overrides=["fit.epochs=8"]).fit.epochs == 8
     assert cfg.loads("", overrides=["fit.epochs=8", "fit.epochs=9"]).fit.epochs == 9
 
-
-def test_the_preset_argument_beats_override_beats_file():
+    # And the argument before an override of the preset.
     assert cfg.loads('preset = "draft"', overrides=["preset=paper"]).preset == "paper"
     config = cfg.loads('preset = "draft"', preset="standard", overrides=["preset=paper"])
     assert config.preset == "standard" and config.fit.epochs == 1200
@@ -106,20 +105,10 @@ def test_file_and_override_beat_the_defaults_of_a_kind_key_by_key():
 
 def test_dists_is_left_to_the_weights_for_a_siren_alone():
     for preset in ("draft", "standard"):
-        found = {kind: cfg.loads("", preset, overrides=[f"representation.kind={kind}"]) for kind in MANY}
-        assert {kind: one.loss.dists for kind, one in found.items()} == dict.fromkeys(MANY, 0.0) | {
-            "siren": "auto"
-        }
+        found = [cfg.loads("", preset, overrides=[f"representation.kind={kind}"]) for kind in MANY]
+        assert [one.loss.dists for one in found] == ["auto", 0.0, 0.0]
     paper = cfg.loads("", preset="paper")
     assert (paper.loss.dists, paper.optimizer.iterations) == (0.6, 400)
-
-
-def test_a_kind_that_is_none_is_refused_by_its_own_key():
-    for value in ("3", "[1]", '"network"'):
-        with pytest.raises(ConfigError, match="representation.kind"):
-            cfg.loads(f"[representation]\nkind = {value}")
-    with pytest.raises(ConfigError, match="representation"):
-        cfg.loads("representation = 3")
 
 
 # ---- targets -----------------------------------------------------------------------------------------------
@@ -137,9 +126,8 @@ def test_a_target_file_changes_no_other_key():
         dataclasses.replace(cfg.Target(rotate_degrees=5), file="/b.exr")
     painted = cfg.loads("[target]\nkind = 'image'\nfile = '/b.exr'\nrotate_degrees = 5")
     assert painted.target.file == "/b.exr" and painted.target.rotate_degrees == 5
-    assert cfg.unused(painted) == [
-        'target.rotate_degrees: no effect: needs target.kind = "envmap", got "image"'
-    ]
+    (said,) = cfg.unused(painted)
+    assert said.startswith("target.rotate_degrees: no effect: needs target.kind")
 
 
 def test_a_map_that_overrides_a_turn_replaces_it_and_the_other_way_round():
@@ -162,10 +150,8 @@ def test_a_map_that_overrides_a_turn_replaces_it_and_the_other_way_round():
 def test_paths_are_relative_to_the_file(tmp_path, here):
     folder = tmp_path / "project"
     folder.mkdir()
-    text = (
-        "[input]\nenvmap = 'maps/sky.exr'\n[scene]\nfile = 'room.xml'\n"
-        "[target]\nkind = 'image'\nfile = '/abs/t.png'\nmask = 'm.png'\n"
-    )
+    text = "[input]\nenvmap = 'maps/sky.exr'\n[scene]\nfile = 'room.xml'\n"
+    text += "[target]\nkind = 'image'\nfile = '/abs/t.png'\nmask = 'm.png'\n"
     (folder / "edit.v2.toml").write_bytes(b"\xef\xbb\xbf" + text.replace("\n", "\r\n").encode())
     config = cfg.load("project/edit.v2.toml", overrides=["target.mask=n.png"])
     assert config.input.envmap == str(folder / "maps/sky.exr")

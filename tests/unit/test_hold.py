@@ -52,15 +52,3 @@ def test_the_weight_grows_where_the_change_is_visible(before, changed, after):
 def test_only_a_weight_that_the_user_left_open_is_raised_where_the_rest_keeps_its_values(target, after):
     found = further(1.0, 0.04, **target)
     assert found is None if after is None else found == pytest.approx(after)
-
-
-@pytest.mark.parametrize(
-    ("weight", "changed", "words"),
-    [
-        (4.0, 0.01, "with less"),
-        (hold.LARGEST_HOLD, 0.01, "with less"),
-        (hold.LARGEST_HOLD, 0.05, "still change by 0.05"),
-    ],
-)
-def test_what_even_the_largest_weight_does_not_hold_is_said(weight, changed, words):
-    assert words in hold.said(weight, changed)

@@ -110,13 +110,11 @@ def test_a_frame_holds_half_floats_and_nothing_that_is_not_finite():
 
 def test_painted_toml_is_what_was_given_and_what_was_painted(tmp_path):
     file = tmp_path / "edit.toml"
-    file.write_text(
-        'seed = 4\n[input]\nenvmap = "sunsky"\nwidth = 64\n[scene]\nfile = "pair"\n[target]\nhold = 2\n'
-    )
+    text = 'seed = 4\n[input]\nenvmap = "sunsky"\nwidth = 64\n[scene]\nfile = "pair"\n'
+    file.write_text(text + "[target]\nhold = 2\n")
     opened = project.opened(str(file))
-    assert (
-        opened.document == protocol.Document() and opened.folder == tmp_path / "edit_out" and not opened.again
-    )
+    assert opened.document == protocol.Document() and not opened.again
+    assert opened.folder == tmp_path / "edit_out"
     light = {"azimuth": 10.0, "elevation": 20.0, "flux": [1, 2, 3], "role": "rim"}
     done = protocol.document(
         {"strokes": [STROKE], "lights": [light], "rotate_degrees": 30, "exposure": 0.5, "temperature": 5000}
@@ -157,23 +155,6 @@ def test_what_paint_cannot_solve_is_refused(tmp_path):
     file.write_text('preset = "paper"\n')
     with pytest.raises(ConfigError, match="expected layers and transport"):
         project.opened(str(file))
-
-
-def test_memory_is_given_back_at_rest_and_now_and_then(monkeypatch):
-    given, resting = [], session.Session.__new__(session.Session)
-    monkeypatch.setattr(session, "give_back_memory", lambda: given.append(resting.phase))
-    resting._worked = lambda: True
-    later = np.inf  # what is due
-    for resting.resting, resting._dragged, resting.phase, resting._memory_due, more, times in (
-        (True, False, "done", later, False, 1),
-        (False, True, "dragging", later, False, 1),  # the next frame needs the buffers
-        (False, False, "drawing", later, True, 1),
-        (False, False, "drawing", 0.0, True, 2),
-        (False, True, "dragging", 0.0, False, 3),
-    ):
-        assert resting.advance() == more
-        assert len(given) == times
-    assert resting.advance() is False and len(given) == 3, "given back again at once"
 
 
 @on_cpu

@@ -152,25 +152,17 @@ def filled(folder, count, used):
     return cache, paths
 
 
-def test_what_was_not_used_for_longest_makes_room(tmp_path):
+@pytest.mark.parametrize(("looked_at", "size", "kept"), [
+    ((), 2500, [0, 2, 3]), ((1,), 2500, [1, 2, 3]), ((), 10_000, [0, 1, 2]),
+])  # fmt: skip
+def test_what_was_not_used_for_longest_makes_room_for_what_is_no_larger_than_the_bound(
+    looked_at, size, kept, tmp_path
+):
     cache, _ = filled(tmp_path, 3, used=[200, 100, 300])
-    cache.store({"i": 3}, {"a": np.full(2500, 3, np.float32)})
-    kept = [i for i in range(4) if cache.load({"i": i}) is not None]
-    assert kept == [0, 2, 3]
+    assert all(cache.load({"i": i}) is not None for i in looked_at)  # a look is a use
+    cache.store({"i": 3}, {"a": np.full(size, 3, np.float32)})
+    assert [i for i in range(4) if cache.load({"i": i}) is not None] == kept
     assert sum(path.stat().st_size for path in tmp_path.iterdir()) <= 35_000
-
-
-def test_a_look_is_a_use(tmp_path):
-    cache, _ = filled(tmp_path, 3, used=[200, 100, 300])
-    assert cache.load({"i": 1}) is not None
-    cache.store({"i": 3}, {"a": np.full(2500, 3, np.float32)})
-    assert cache.load({"i": 0}) is None and cache.load({"i": 1}) is not None
-
-
-def test_an_entry_above_the_bound_is_not_kept_and_drives_nothing_out(tmp_path):
-    cache, _ = filled(tmp_path, 3, used=[200, 100, 300])
-    cache.store({"i": 3}, {"a": np.zeros(10_000, np.float32)})
-    assert [cache.load({"i": i}) is not None for i in range(4)] == [True, True, True, False]
 
 
 def test_nothing_but_its_own_files_is_deleted(tmp_path):

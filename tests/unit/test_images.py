@@ -61,20 +61,12 @@ def test_load_envmap(tmp_path, rng):
 
     p["R"][5, 6], p["R"][5, 2] = np.nan, np.inf
     path = exr(tmp_path / "a.exr", **p)
-    with pytest.raises(
-        InputError, match=r"a.exr: 2 texels are NaN or infinite, the first at row 5, column 2"
-    ):
+    with pytest.raises(InputError, match=r"a.exr: 2 texels are NaN .*, the first at row 5, column 2"):
         images.load_envmap(path, width=8)
     found, info = images.load_envmap(path, width=8, repair=True)
     assert np.isfinite(found).all() and (found >= 0).all() and info["repaired"] == 2
-    assert (
-        "1 texels are infinite, the first at row 5, column 2: taken for the brightest light, 65504"
-        in (info["warnings"])
-    )
-    assert (
-        "1 texels are NaN or -Inf, the first at row 5, column 6: replaced from their neighbours"
-        in (info["warnings"])
-    )
+    said = " ".join(info["warnings"])
+    assert "row 5, column 2: taken for the brightest" in said and "row 5, column 6: replaced from" in said
     np.testing.assert_allclose(images.load_envmap(path, repair=True)[0][5, 2, 0], 65504)
 
 
@@ -168,9 +160,7 @@ def test_write_exr_round_trip(tmp_path, rng):
 def test_non_finite_values_reach_no_file(tmp_path, bad, writer):
     values = np.zeros((4, 8, 3))
     values[2, 5, 1] = bad
-    with pytest.raises(
-        NumericalError, match=r"o.x: not written: 1 texels .* row 2, column 5 \(0, (nan|inf), 0\)"
-    ):
+    with pytest.raises(NumericalError, match=r"o.x: not written: 1 texels .* row 2, column 5"):
         writer(tmp_path / "o.x", values)
     assert not os.listdir(tmp_path)
 

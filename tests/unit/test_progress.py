@@ -107,10 +107,3 @@ def test_a_bar_is_closed_when_the_run_fails():
         shown.update(1, 4)
         raise KeyError
     assert shown._bar is None
-
-
-def test_it_speaks_on_the_error_stream(capsys):
-    with Progress() as shown:
-        shown.stage("editing")
-    captured = capsys.readouterr()
-    assert captured.out == "" and captured.err == "editing\n"

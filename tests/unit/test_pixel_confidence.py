@@ -13,10 +13,13 @@ def pictures(rng, noise=0.003):
     return [base + noise * rng.normal(size=SHAPE) for _ in range(2)], base
 
 
-def test_equal_pictures_are_trusted(rng):
+def test_equal_pictures_and_noise_alone_are_trusted(rng):
     (_, _), base = pictures(rng)
     assert pixel_confidence.weights(base, base, 1 / 8, base) is None
     assert pixel_confidence.weights(base, base, 1 / 8, base, np.zeros(SHAPE[:2])) is None
+    base = np.full(SHAPE, 0.5)
+    both = [base + rng.random(SHAPE) for _ in range(2)]
+    assert pixel_confidence.weights(*both, 1 / 8, base) is None
 
 
 @pytest.mark.parametrize("noise", [0.003, 0.03])
@@ -93,12 +96,6 @@ def test_radiance_at_the_extremes_is_finite(rng):
     first[5, 5], second[6, 6], first[8, 8] = 3e38, 0, 1e-30
     found = pixel_confidence.weights(first, second, 1 / 8, base)
     assert np.isfinite(found).all() and found.min() >= 0 and found.max() <= 1
-
-
-def test_a_picture_of_noise_alone_is_trusted_as_a_whole(rng):
-    base = np.full(SHAPE, 0.5)
-    both = [base + rng.random(SHAPE) for _ in range(2)]
-    assert pixel_confidence.weights(*both, 1 / 8, base) is None
 
 
 def test_noise_at_the_edge_of_a_view_says_nothing_of_the_next(rng):

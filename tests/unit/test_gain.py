@@ -20,9 +20,8 @@ def tensors(params):
 def random(g, rng, size=1.0):
     """Random parameters, each in its own unit."""
     scales = g.scales()
-    return {
-        n: size * scales[n] * rng.standard_normal(v.shape).astype(np.float32) for n, v in g.init().items()
-    }
+    drawn = {n: rng.standard_normal(v.shape).astype(np.float32) for n, v in g.init().items()}
+    return {n: size * scales[n] * value for n, value in drawn.items()}
 
 
 def field(g, params, shape):
@@ -58,10 +57,6 @@ def poles(share):
     return (0, -1) if share == 1 else (0,)
 
 
-def levels(g):
-    return range(len(g.sizes))
-
-
 # ---- grids -------------------------------------------------------------------------------------------------
 
 
@@ -79,7 +74,7 @@ def test_grids_double_and_are_as_fine_in_elevation_as_in_azimuth(cycles, share):
 @pytest.mark.parametrize("shape", SHAPES)
 def test_hats_are_a_partition_of_unity(cycles, share, shape):
     g = gain.GridGain(cycles, share)
-    for level in levels(g):
+    for level in range(len(g.sizes)):
         taps = g.hats(level, shape)
         rows, columns = g.sizes[level]
         assert len(taps) == min(3, rows) * min(3, columns)
@@ -154,11 +149,7 @@ def test_finer_grids_start_at_nothing_and_move_as_far_as_they_are_known(rng):
     unit = fine.scales()["gain.3"]
     assert unit.shape == (*size, 3) and np.allclose(unit, gain.DETAIL * known[..., None])
     params = {k: rng.normal(size=v.shape).astype(np.float32) for k, v in coarse.init().items()}
-    both = [
-        g.evaluate({k: mi.TensorXf(v) for k, v in (g.init() | params).items()}, g.prepare((16, 64)))
-        for g in (coarse, fine)
-    ]
-    assert np.array_equal(*(np.array(field) for field in both))
+    assert np.array_equal(*(field(g, g.init() | params, (16, 64)) for g in (coarse, fine)))
 
 
 # ---- where nodes are ---------------------------------------------------------------------------------------

@@ -74,9 +74,8 @@ def test_transposed_is_the_dense_transpose_of_some_rows(rng, shape, vectors):
         values = rng.standard_normal((vectors, len(some), 3)).astype(np.float32)
         got = matrix.transposed(some, values)
         expected = np.einsum("ijc,kic->kjc", full[some], values.astype(np.float64))
-        magnitude = np.einsum(
-            "ijc,kic->kjc", np.abs(dense(*entry[:2], np.abs(entry[2]), shape))[some], np.abs(values)
-        )
+        sizes = dense(*entry[:2], np.abs(entry[2]), shape)[some]
+        magnitude = np.einsum("ijc,kic->kjc", sizes, np.abs(values))
         assert got.shape == (vectors, shape[1], 3) and got.dtype == np.float32
         # Products and the result are rounded, sums are in float64; entries may share a place.
         assert (np.abs(got - expected) <= 4 * 2.0**-24 * magnitude).all()
@@ -166,21 +165,12 @@ def test_merge_adds_entries_of_one_place_and_sorts_them(rng):
     expected = dense(rows, columns, weights, (6, 5))[r, c]
     np.testing.assert_allclose(w, expected, rtol=2.0**-23, atol=1e-12)
     assert (r.dtype, c.dtype, w.dtype) == (np.uint32, np.uint32, np.float32)
-
-
-def test_merge_keeps_a_small_light_beside_a_large_one():
     # 1e8 + 1 in float32 is 1e8: sums are accumulated in float64.
     zero = np.zeros(4, np.uint32)
     weights = np.array([[1e8], [1.0], [-1e8], [1.0]], np.float32).repeat(3, axis=1)
     np.testing.assert_array_equal(merge(zero, zero, weights, 1)[2], [[2, 2, 2]])
-
-
-def test_merge_of_nothing_is_nothing():
     r, c, w = merge(np.zeros(0, np.uint32), np.zeros(0, np.uint32), np.zeros((0, 3), np.float32), 7)
     assert r.shape == c.shape == (0,) and w.shape == (0, 3)
-
-
-def test_merge_knows_places_beyond_32_bits():
     rows, columns = np.array([200_000, 200_000, 0], np.uint32), np.array([99_999, 99_999, 1], np.uint32)
     r, c, w = merge(rows, columns, np.ones((3, 3), np.float32), 100_000)
     np.testing.assert_array_equal(np.stack([r, c]), [[0, 200_000], [1, 99_999]])

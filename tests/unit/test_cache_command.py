@@ -40,9 +40,6 @@ def test_entries_and_sizes(home, capsys):
     said = lines(capsys)
     assert said[0].endswith("2 entries, 8.0 MB") and said[1].endswith("1 entry, 1.0 MB")
     assert len(files) == 3 and all(file.is_file() for file in files)
-
-
-def test_empty_deletes_the_entries_and_nothing_else(home, capsys):
     files = keep("transport", 2, 10) + keep("fits", 1, 10)
     scene = home / "usd" / "0" / "converted.json"
     scene.parent.mkdir(parents=True)

@@ -83,11 +83,13 @@ def test_exr_of_many_channels_is_refused_before_it_is_decoded(tmp_path, rng, mon
         images.read(path)
 
 
-def test_exr_luminance_is_grey(tmp_path, rng):
+def test_exr_luminance_is_grey_and_no_colour_is_refused(tmp_path, rng):
     y = rng.random((4, 8)).astype(np.float32)
     found, info = images.read(exr(tmp_path / "y.exr", Y=y))
     np.testing.assert_array_equal(found, np.repeat(y[..., None], 3, 2))
     assert "luminance" in info["warnings"][0]
+    with pytest.raises(InputError, match=r"z.exr: no R, G, B channels \(found: Z\)"):
+        images.read(exr(tmp_path / "z.exr", Z=rng.random((4, 8)).astype(np.float32)))
 
 
 def test_exr_window_and_primaries(tmp_path, rng):
@@ -102,11 +104,6 @@ def test_exr_window_and_primaries(tmp_path, rng):
     assert "cropped" in info["warnings"][0]
     _, info = images.read(exr(tmp_path / "aces.exr", header, **p))
     assert "converted from ACES2065-1 to Rec. 709" in info["warnings"][0]
-
-
-def test_exr_without_colour(tmp_path, rng):
-    with pytest.raises(InputError, match=r"z.exr: no R, G, B channels \(found: Z\)"):
-        images.read(exr(tmp_path / "z.exr", Z=rng.random((4, 8)).astype(np.float32)))
 
 
 def rgbe_file(path, body, size="-Y 4 +X 8", header="FORMAT=32-bit_rle_rgbe\n"):

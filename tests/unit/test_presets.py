@@ -82,15 +82,12 @@ def test_loss_and_length_suit_the_kind(preset, kind, ssim, iterations):
         assert (config.loss.ssim, config.optimizer.iterations) == (ssim, iterations)
 
 
-def test_the_kind_that_counts_is_the_last_one_given():
+def test_the_last_kind_counts_and_file_and_override_beat_its_defaults_key_by_key():
     text = '[representation]\nkind = "siren"'
     assert cfg.loads(text).optimizer.iterations == "auto"
     assert cfg.loads(text, overrides=["representation.kind=layers"]).optimizer.iterations == 100
     assert cfg.loads(text, overrides=["representation.kind=pixels"]).loss.ssim == 1.0
     assert cfg.loads("", preset="paper").representation.kind == "siren"
-
-
-def test_file_and_override_beat_the_defaults_of_a_kind_key_by_key():
     text = 'preset = "draft"\n[representation]\nkind = "pixels"\n[optimizer]\niterations = 7'
     config = cfg.loads(text)
     assert (config.optimizer.iterations, config.loss.ssim) == (7, 1.0)
@@ -147,7 +144,7 @@ def test_a_map_that_overrides_a_turn_replaces_it_and_the_other_way_round():
 # ---- files and paths ---------------------------------------------------------------------------------------
 
 
-def test_paths_are_relative_to_the_file(tmp_path, here):
+def test_paths_are_relative_to_the_file_and_names_that_are_no_paths_stay(tmp_path, here):
     folder = tmp_path / "project"
     folder.mkdir()
     text = "[input]\nenvmap = 'maps/sky.exr'\n[scene]\nfile = 'room.xml'\n"
@@ -159,9 +156,6 @@ def test_paths_are_relative_to_the_file(tmp_path, here):
     assert config.target.file == "/abs/t.png"
     assert config.target.mask == str(folder / "n.png")
     assert config.output.dir == str(folder / "edit.v2_out")
-
-
-def test_names_that_are_no_paths_stay():
     config = cfg.loads("[scene]\nfile = 'mirror'", base_dir="/d")
     assert config.scene.file == "mirror" and config.input.envmap == "auto" and config.target.file == ""
     config = cfg.loads("[scene]\nfile = './mirror'\n[input]\nenvmap = './sunsky'", base_dir="/d")

@@ -36,9 +36,6 @@ def test_contributions_that_are_not_finite_are_left_out_and_counted(monkeypatch)
     np.testing.assert_array_equal(got.pixels, [0, 7])
     np.testing.assert_array_equal(got.texels, [0, 7])
     np.testing.assert_allclose(got.weights, [(2, 3, 4), (0, 0, 1e-30)], rtol=1e-6)
-
-
-def test_nothing_but_non_finite_contributions_is_an_empty_record(monkeypatch):
     got = record(monkeypatch, batch((NAN, NAN, NAN), (INF, INF, INF)))
     assert got.lost == 2 and got.weights.shape == (0, 3) and len(got.pixels) == len(got.texels) == 0
 

@@ -292,14 +292,11 @@ def test_paint_and_rest_have_their_weights_whatever_their_size():
     np.testing.assert_allclose(weight / weight.sum(), shares / 4, rtol=1e-5)
 
 
-def test_what_tells_nothing_has_no_weight():
+def test_what_tells_nothing_has_no_weight_and_a_target_without_any_is_refused():
     excluded = np.zeros((4, 5), bool)
     excluded[1] = True
     weight = pixel_weights.pixel_weight(np.ones((4, 5, 1)), excluded, paint=1, hold=1)
     assert not weight[1].any() and (weight[[0, 2, 3]] == weight[0, 0]).all()
-
-
-def test_a_target_without_weight_is_refused():
     with pytest.raises(InputError, match="no pixel counts"):
         pixel_weights.pixel_weight(np.ones((4, 5, 1)), np.zeros((4, 5), bool), paint=0, hold=1)
     with pytest.raises(ConfigError, match=r"target\.paint"):

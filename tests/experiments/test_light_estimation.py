@@ -39,39 +39,25 @@ def lights(*azimuths):
 # ---- Measures of pictures ----------------------------------------------------------------------------------
 
 
-def test_errors_are_summed_over_channels_and_divided_by_pixels():
-    """Squared errors 1 and 1 + 4, whose mean is 3; the best factor is 1; angles 0 and 90 degrees."""
-    found = protocol.compared(picture((1, 0, 0), (0, 1, 0)), picture((2, 0, 0), (0, 0, 2)))
-    assert found["rmse"] == pytest.approx(math.sqrt(3)) and found["si_rmse"] == pytest.approx(math.sqrt(3))
-    assert found["angle"] == pytest.approx(45)
-
-
-def test_one_factor_for_all_pixels():
-    """(1, 1, 1) and (1, 1, 1) against 1 and 3 of gray: factor 2, errors 3 and 3 in both pixels."""
-    found = protocol.compared(picture((1, 1, 1)), picture((1, 1, 1), (3, 3, 3)))
-    assert found["rmse"] == pytest.approx(math.sqrt(6)) and found["si_rmse"] == pytest.approx(math.sqrt(3))
-    assert found["angle"] == pytest.approx(0, abs=1e-5)
-
-
-def test_each_picture_is_normalised_by_itself():
-    """1 everywhere is 1; 2 and 4 are 1/2 and 1: an error of 3/4 in half of the pixels."""
-    found = protocol.compared(picture((1, 1, 1)), picture((2, 2, 2), (4, 4, 4)))
-    assert found["normalised"] == pytest.approx(math.sqrt(0.375))
-    assert protocol.compared(picture((1, 2, 3)), picture((5, 10, 15)))["normalised"] == pytest.approx(0)
-
-
-def test_one_colour_differs_by_its_factor_alone():
-    found = protocol.compared(picture((1, 2, 3)), picture((3, 6, 9)))
-    assert found["rmse"] == pytest.approx(math.sqrt(56))
-    assert found["si_rmse"] == pytest.approx(0, abs=1e-6) and found["angle"] == pytest.approx(0, abs=1e-5)
-
-
-def test_a_black_picture_has_the_error_of_the_true_one_and_no_angle():
-    black = picture((0, 0, 0))
-    found = protocol.compared(black, picture((1, 1, 1)))
-    assert [found[key] for key in ("rmse", "si_rmse", "normalised")] == pytest.approx([math.sqrt(3)] * 3)
-    assert math.isnan(found["angle"])
-    assert protocol.compared(black, black)["rmse"] == 0
+@pytest.mark.parametrize(("found", "true", "expected"), [
+    # Squared errors 1 and 1 + 4, whose mean is 3; the best factor is 1; angles 0 and 90 degrees.
+    (((1, 0, 0), (0, 1, 0)), ((2, 0, 0), (0, 0, 2)), {"rmse": 3, "si_rmse": 3, "angle": 45}),
+    # (1, 1, 1) and (1, 1, 1) against 1 and 3 of gray: factor 2, errors 3 and 3 in both pixels.
+    (((1, 1, 1),), ((1, 1, 1), (3, 3, 3)), {"rmse": 6, "si_rmse": 3, "angle": 0}),
+    # 1 everywhere is 1; 2 and 4 are 1/2 and 1: an error of 3/4 in half of the pixels.
+    (((1, 1, 1),), ((2, 2, 2), (4, 4, 4)), {"normalised": 0.375}),
+    (((1, 2, 3),), ((5, 10, 15),), {"normalised": 0}),
+    (((1, 2, 3),), ((3, 6, 9),), {"rmse": 56, "si_rmse": 0, "angle": 0}),
+    (((0, 0, 0),), ((1, 1, 1),), {"rmse": 3, "si_rmse": 3, "normalised": 3, "angle": math.nan}),
+    (((0, 0, 0),), ((0, 0, 0),), {"rmse": 0}),
+])  # fmt: skip
+def test_errors_are_those_worked_out_by_hand(found, true, expected):
+    """Of squares that are summed over channels and divided by pixels; the angle is in degrees."""
+    errors = protocol.compared(picture(*found), picture(*true))
+    for key, value in expected.items():
+        root = value if key == "angle" else math.sqrt(value)
+        least = {"angle": 1e-5, "si_rmse": 1e-6}.get(key, 1e-12)
+        assert errors[key] == pytest.approx(root, abs=least, nan_ok=True)
 
 
 # ---- Measures of maps --------------------------------------------------------------------------------------

@@ -9,28 +9,17 @@ from experiments.engine import tables
 from experiments.summary import values
 from tests.oracles import ROOT
 
-SIREN = {
-    "step": {"median_s": 2.0},
-    "forward": {"min_s": 1.0},
-    "kernels": {"calls": 5, "launched": 10, "compiled": 0},
-}
-TRANSPORT = {
-    "kernels": SIREN["kernels"],
-    "adjointness": 1e-7,
-    "columns": 1,
-    "read": 1,
-    "floor_s": 1e-3,
-    "load_s": 0.1,
-}
+KERNELS = {"kernels": {"calls": 5, "launched": 10, "compiled": 0}}
+SIREN = KERNELS | {"step": {"median_s": 2.0}, "forward": {"min_s": 1.0}}
+TRANSPORT = KERNELS | {"adjointness": 1e-7, "columns": 1, "read": 1, "floor_s": 1e-3, "load_s": 0.1}
 QUALITY = {"quick": True, "prb_rmse": 0.1, "rmse": 0.02, "corrected": 0.02, "noise": 0.01}
 FITS = {"noisy_worst": 30.0, "noisy_mean": 31.0, "log_psnr": 40.0}
 
 
 def rows(section, table, row):
     """Return rows of all tables of a section, one of them as given."""
-    others = [
-        {"table": name} for name in tables.NEEDED[section] if name != table and name not in tables.CHECKS
-    ]
+    given = {table, *tables.CHECKS}
+    others = [{"table": name} for name in tables.NEEDED[section] if name not in given]
     common = {"case": "x", "section": section, "quick": False, "not_finite": []}
     return [values(common | one) for one in [*others, {"table": table} | row]]
 

@@ -72,14 +72,9 @@ def test_the_script_measures_at_tiny_sizes(tmp_path):
     """Other tests run what *doctor* and *engine* do, and *quickstart* is as *solver*."""
     script = ROOT / "experiments/gpu.sh"
     command = ["bash", script, tmp_path / "gpu.json", "--small", "--steps", "solver", "fit"]
-    own = {"PYTHON": sys.executable, "XDG_CACHE_HOME": str(tmp_path / "cache")}
-    done = subprocess.run(
-        [*command, "--variant", "llvm_ad_rgb"],
-        env=os.environ | own,
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-    )
+    command += ["--variant", "llvm_ad_rgb"]
+    own = os.environ | {"PYTHON": sys.executable, "XDG_CACHE_HOME": str(tmp_path / "cache")}
+    done = subprocess.run(command, env=own, cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
     steps = json.loads((tmp_path / "gpu.json").read_text())["steps"]
     found = {step: one["llvm_ad_rgb"] for step, one in steps.items()}

@@ -111,13 +111,19 @@ def test_a_case_may_be_a_function(tmp_path, capsys, monkeypatch):
     assert len(keys) == 3
 
 
-def test_rows_may_be_combined(tmp_path):
+def test_rows_are_combined_into_tables_and_panels_into_montages(tmp_path):
     made = Experiment(
         lambda given: [],
         columns={"kind": "{kind}", "sum": "{n}"},
         combine=lambda rows: [{"kind": "both", "n": sum(row["n"] for row in rows)}],
     )
     assert harness.table(made, [{"n": 1}, {"n": 2}]).endswith("| both | 3 |")
+    assert markdown(["a", "b"], [["1", "2"]]) == "| a | b |\n| --- | --- |\n| 1 | 2 |"
+    gap = harness.GAP
+    made = montage([[np.full((2, 3, 3), 0.5), np.ones((4, 4, 3))], [np.full((4, 1, 3), 2.0)]])
+    assert made.shape == (2 * (4 + gap), 6 + 4 + 2 * gap, 3) and made.dtype == np.uint8
+    assert (made[:4, :6] == 128).all() and (made[:4, 6 + gap : 10 + gap] == 255).all()
+    assert (made[4 + gap : 8 + gap, :1] == 255).all() and not made[4 + gap :, 1:].any()
 
 
 def test_user_errors_are_one_line(run, tmp_path):
@@ -137,15 +143,6 @@ def test_an_override_beats_the_case_and_a_target_file_its_turn():
     found = config.loads(Case("x", tables).job(["seed=2", "target.file=/b.exr"]).toml)
     assert found.seed == 2 and found.target == config.Target(rotate_degrees="auto", spp=8, file="/b.exr")
     assert tables == {"seed": 1, "target": {"rotate_degrees": 60.0, "spp": 8}}
-
-
-def test_tables_and_montages():
-    assert markdown(["a", "b"], [["1", "2"]]) == "| a | b |\n| --- | --- |\n| 1 | 2 |"
-    gap = harness.GAP
-    made = montage([[np.full((2, 3, 3), 0.5), np.ones((4, 4, 3))], [np.full((4, 1, 3), 2.0)]])
-    assert made.shape == (2 * (4 + gap), 6 + 4 + 2 * gap, 3) and made.dtype == np.uint8
-    assert (made[:4, :6] == 128).all() and (made[:4, 6 + gap : 10 + gap] == 255).all()
-    assert (made[4 + gap : 8 + gap, :1] == 255).all() and not made[4 + gap :, 1:].any()
 
 
 MAPS = [

@@ -228,16 +228,11 @@ def test_nested_values_are_written_and_come_back(table):
 
 known = [f.name for f in dataclasses.fields(cfg.Config)]
 keys = st.sampled_from(known + [k for t in schema.FIELDS.values() for k in t]) | st.text(max_size=5)
+scalars = [st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=5), st.dates()]
+scalars += [st.binary(max_size=3), st.complex_numbers()]
+odd = st.sampled_from(["auto", "sunsky", "layers", "image", "strokes", "\ud800", "a\0b", 10**4000, math.inf])
 anything = st.recursive(
-    st.none()
-    | st.booleans()
-    | st.integers()
-    | st.floats()
-    | st.text(max_size=5)
-    | st.binary(max_size=3)
-    | st.dates()
-    | st.complex_numbers()
-    | st.sampled_from(["auto", "sunsky", "layers", "image", "strokes", "\ud800", "a\0b", 10**4000, math.inf]),
+    st.one_of(*scalars, odd),
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(keys | st.integers(), inner, max_size=4),
     max_leaves=8,
 )

@@ -22,7 +22,6 @@ QUICK = config.Fit(epochs=4, lr=5e-3, awp_gamma=0.0)
 
 
 def sky(rng, height=16, width=32, peak=50.0):
-    """Smooth sky with a sun a few texels wide."""
     row, column = np.mgrid[:height, :width]
     base = 0.4 + 0.3 * np.cos(2 * np.pi * column / width) * np.sin(np.pi * (row + 0.5) / height)
     sun = peak * np.exp(-((row - height * 0.3) ** 2 + (column - width * 0.6) ** 2) / 4)
@@ -31,14 +30,12 @@ def sky(rng, height=16, width=32, peak=50.0):
 
 
 def picture(fitted, network, shape, rows=None):
-    """What a fitted network makes of its own points."""
     x = fit.points(network, shape, rows)
     params = {name: mi.TensorXf(np.float32(value)) for name, value in fitted.params.items()}
     return fit.evaluate(params, fitted.normalisation, x, shape, network.omega).numpy()
 
 
 def facts(fitted):
-    """All of a fit but its weights and whether it was read from disk."""
     found = dataclasses.asdict(fitted)
     return {key: found[key] for key in ("normalisation", "log_psnr", "peak_ratio", "epochs")}
 
@@ -79,7 +76,6 @@ def test_normalisation_is_equation_1_between_ends_that_are_left_free(headroom, r
 
 
 def rows(image):
-    """Reorder an image (H, W, 3) as the network's output (H * W, 3)."""
     return np.ascontiguousarray(np.asarray(image).reshape(-1, 3))
 
 
@@ -393,26 +389,13 @@ def test_other_settings_are_another_fit(tmp_path, rng):
     fit.fit(image, NETWORK, quick, folder=tmp_path)
     brighter = image.copy()
     brighter[0, 0, 0] += 1e-6
-    others = [
-        (brighter, NETWORK, quick, 0),
-        (image.reshape(32, 16, 3), NETWORK, quick, 0),
-        (image, dataclasses.replace(NETWORK, hidden=13), quick, 0),
-        (image, dataclasses.replace(NETWORK, depth=2), quick, 0),
-        (image, dataclasses.replace(NETWORK, omega=29.0), quick, 0),
-        (image, NETWORK, dataclasses.replace(quick, lr=4e-3), 0),
-        (image, NETWORK, dataclasses.replace(quick, schedule="constant"), 0),
-        (image, NETWORK, dataclasses.replace(quick, hdr=0.02), 0),
-        (image, NETWORK, dataclasses.replace(quick, awp_gamma=0.01), 0),
-        (image, NETWORK, dataclasses.replace(quick, awp_until=0.5), 0),
-        (image, NETWORK, dataclasses.replace(quick, beta2=0.98), 0),
-        (image, NETWORK, dataclasses.replace(quick, stride=1), 0),
-        (image, NETWORK, dataclasses.replace(quick, headroom=0.1), 0),
-        (image, NETWORK, dataclasses.replace(quick, light=0.5), 0),
-        (image, dataclasses.replace(NETWORK, coordinates="plane"), quick, 0),
-        (image, NETWORK, quick, 0, (0, 17)),
-        (image, NETWORK, quick, 0, (1, 17)),
-        (image, NETWORK, quick, 1),
-    ]
+    of_network = {"hidden": 13, "depth": 2, "omega": 29.0, "coordinates": "plane"}
+    of_fit = {"lr": 4e-3, "schedule": "constant", "hdr": 0.02, "awp_gamma": 0.01, "awp_until": 0.5}
+    of_fit |= {"beta2": 0.98, "stride": 1, "headroom": 0.1, "light": 0.5}
+    others = [(brighter, NETWORK, quick, 0), (image.reshape(32, 16, 3), NETWORK, quick, 0)]
+    others += [(image, dataclasses.replace(NETWORK, **{k: v}), quick, 0) for k, v in of_network.items()]
+    others += [(image, NETWORK, dataclasses.replace(quick, **{k: v}), 0) for k, v in of_fit.items()]
+    others += [(image, NETWORK, quick, *more) for more in ((0, (0, 17)), (0, (1, 17)), (1,))]
     for other in others:
         assert not fit.fit(*other, folder=tmp_path).cached
     assert len(list(tmp_path.iterdir())) == 1 + len(others)

@@ -46,37 +46,25 @@ class Page(HTMLParser):
 
 
 SCORES = {"ssim": 0.98, "mse": 1e-4, "lpips": None, "log_rmse": 0.2, "beyond_display": 0.0}
-METRICS = {
-    "render": {"psnr": 38.71, **SCORES},
-    "initial": {"psnr": 19.2, **SCORES},
-    "ceiling": None,
-    "envmap": None,
-    "painted": None,
+METRICS = {"render": {"psnr": 38.71, **SCORES}, "initial": {"psnr": 19.2, **SCORES}}
+METRICS |= dict.fromkeys(("ceiling", "envmap", "painted"))
+METRICS |= {
     "fit": {"log_psnr": 45.7, "peak_ratio": 0.88, "epochs": 400, "cached": False},
     "timing": {"edit_s": 21.4, "total_s": 47.3, "report_s": None, "per_iteration_ms": 53.5},
-    "iterations": 2,
-    "non_finite_steps": 0,
-    "tonemap": "gamma",
-    "active_rows": [0, 7],
 }
+METRICS |= {"iterations": 2, "non_finite_steps": 0, "tonemap": "gamma", "active_rows": [0, 7]}
 
 
 def write(path, settings=None, manifest=None, metrics=None, **changes):
     found = {
-        "envmap": grey(2.0),
-        "metrics": METRICS | (metrics or {}),
         "history": [{"iteration": 0, "loss": 1.0}, {"iteration": 1, "loss": 0.1}],
         "renders": {"initial": grey(0.1), "target": grey(0.5), "edited": grey(0.4)},
         "maps": {"initial": grey(1.0), "target": None, "edited": grey(2.0)},
-        "lights": {},
-        "core": grey(0.0),
-        "views": (),
-        "warnings": [],
-        "notes": ["renderer.spp = 64"],
     }
-    result = Result(**{**found, **changes})
+    found |= {"envmap": grey(2.0), "core": grey(0.0), "metrics": METRICS | (metrics or {})}
+    found |= {"lights": {}, "views": (), "warnings": [], "notes": ["renderer.spp = 64"]}
     manifest = {"variant": "llvm_ad_rgb"} if manifest is None else manifest
-    html_report.write_report(path, result, settings or config.Config(), manifest)
+    html_report.write_report(path, Result(**found | changes), settings or config.Config(), manifest)
     return Page(path)
 
 
@@ -153,16 +141,10 @@ def test_report_of_a_known_map_and_a_failed_edit(tmp_path):
 def test_report_escapes_all_text(tmp_path):
     nasty = "<script>alert('&')</script> Gemälde/заря \udcff"
     file = "<script>alert('&') Gemälde"
-    page = write(
-        tmp_path / "r.html",
-        settings=config.Config(scene=config.Scene(file=file)),
-        manifest={nasty: nasty},
-        metrics={nasty: nasty, "tonemap": nasty, "fit": {nasty: 1}},
-        history=[{nasty: 1.0}],
-        lights={"before": [], "after": [light(1, 20, 30)]},
-        warnings=[nasty],
-        notes=[nasty],
-    )
+    changes = {"metrics": {nasty: nasty, "tonemap": nasty, "fit": {nasty: 1}}, "history": [{nasty: 1.0}]}
+    changes |= {"lights": {"before": [], "after": [light(1, 20, 30)]}, "warnings": [nasty], "notes": [nasty]}
+    settings = config.Config(scene=config.Scene(file=file))
+    page = write(tmp_path / "r.html", settings, {nasty: nasty}, **changes)
     assert "script" not in page.tags
     assert page.text.count("<script>alert('&')</script> Gemälde/заря") == 8
     assert page.text.count(file) == 3  # title, heading and configuration

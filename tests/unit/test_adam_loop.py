@@ -138,9 +138,8 @@ def test_texels_that_are_not_free_keep_their_bits_and_pull_nothing(rng):
             return objective(rendering, crop, step)
 
     start = params["log_radiance"].numpy()
-    changed, state = adam_loop.optimise(
-        representation, params, Watching(), Listening(), original, 0, arguments[-1], free=free
-    )
+    watched = representation, params, Watching(), Listening(), original, 0, arguments[-1]
+    changed, state = adam_loop.optimise(*watched, free=free)
     for image, crop in zip(seen, crops, strict=True):
         assert image[:3][~free].tobytes() == original[:3][~free].tobytes() == crop[~free].tobytes()
         assert image[3:].tobytes() == original[3:].tobytes()
@@ -184,9 +183,7 @@ def test_no_iterations_leave_the_parameters(rng):
 def test_observer_is_told_of_every_row_and_of_the_end(rng):
     arguments, _ = case(rng, iterations=25)
     seen = []
-    adam_loop.optimise(
-        *arguments, after_step=lambda state, adam: seen.append((state.step, len(state.history)))
-    )
+    adam_loop.optimise(*arguments, after_step=lambda s, adam: seen.append((s.step, len(s.history))))
     assert seen[-1] == (25, 25) and len(seen) >= 3
     assert all(step == rows for step, rows in seen)
 
@@ -212,9 +209,7 @@ def test_bad_renderings_are_counted_taken_back_and_halve_the_rate(value, rng):
     """The step that led to a bad rendering is undone, and good steps win the rate back, ten for a halving."""
     arguments, _ = case(rng, iterations=8, lr=0.02, bad={2, 3, 6}, value=value)
     seen = [arrays(arguments[1])]
-    params, state = adam_loop.optimise(
-        *arguments, after_step=lambda _, adam: seen.append(arrays(adam.params))
-    )
+    params, state = adam_loop.optimise(*arguments, after_step=lambda _, a: seen.append(arrays(a.params)))
     assert same(seen[3], seen[1]) and same(seen[4], seen[1]) and same(seen[7], seen[5])
     assert not any(same(seen[i], seen[i + 1]) for i in (0, 1, 2, 4, 5, 6, 7))
     assert (state.bad_steps, state.bad_in_a_row) == (3, 0)
@@ -257,9 +252,8 @@ def test_a_run_that_is_cut_and_continued_gives_the_same_bits(cut, rng):
     arguments = fresh()
     adam = optimizer.Adam(arguments[1], 123.0, (0.9, arguments[6].beta2))
     adam.load_state_dict(kept["adam"])
-    params, state = adam_loop.optimise(
-        *arguments, adam=adam, state=adam_loop.State(**json.loads(kept["state"]))
-    )
+    state = adam_loop.State(**json.loads(kept["state"]))
+    params, state = adam_loop.optimise(*arguments, adam=adam, state=state)
     assert same(arrays(params), arrays(expected))
     assert json.dumps(without_times(state.history)) == json.dumps(without_times(whole.history))
     assert (state.bad_steps, state.slowdown) == (whole.bad_steps, whole.slowdown)

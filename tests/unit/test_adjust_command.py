@@ -90,10 +90,8 @@ def test_the_command_keeps_format_and_colour_space_and_writes_a_backplate(rng, c
     images.write_exr("sky.exr", sky, half=True, chromaticities=primaries.ACES_AP1)
     plate = ["--background", "plate.exr", "--background-exposure", "-2"]
     assert adjust.main(["sky.exr", "--exposure", "1", *plate, "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["files"] == {
-        "map": "sky_adjusted.exr",
-        "background": "plate.exr",
-    }
+    files = json.loads(capsys.readouterr().out)["files"]
+    assert files == {"map": "sky_adjusted.exr", "background": "plate.exr"}
     before, after, plate = (map_file.read(name) for name in ("sky.exr", "sky_adjusted.exr", "plate.exr"))
     assert after.half and after.chromaticities is not None
     np.testing.assert_allclose(after.stored, 2 * before.stored, rtol=2e-3, atol=1e-3)

@@ -16,7 +16,6 @@ KEY = {"scene": "abc", "seed": 3, "grid": [8, 16]}
 
 
 def some(rng, size=3000):
-    """Arrays of every kind that is kept."""
     return {
         "packed": rng.standard_normal((size, 4)).astype(np.float32),
         "start": rng.integers(0, 2**32, 7, dtype=np.uint32),
@@ -32,15 +31,12 @@ def only_file(folder):
     return path
 
 
-def test_the_same_bits_come_back(tmp_path, rng):
+def test_the_same_bits_come_back_of_any_layout(tmp_path, rng):
     cache, arrays = DiskCache(tmp_path / "a" / "b"), some(rng)
     assert cache.load(KEY) is None
     cache.store(KEY, arrays)
     assert same_bits(cache.load(KEY), arrays)
     assert same_bits(DiskCache(tmp_path / "a" / "b").load(dict(reversed(KEY.items()))), arrays)
-
-
-def test_arrays_of_any_layout_are_kept(tmp_path, rng):
     image = rng.random((6, 5, 4))
     DiskCache(tmp_path).store(KEY, {"a": image[::2, :, 1:3].T})
     np.testing.assert_array_equal(DiskCache(tmp_path).load(KEY)["a"], image[::2, :, 1:3].T)

@@ -198,12 +198,14 @@ def test_gradient_of_a_whole_map_is_that_of_finite_differences(rng):
     _, made, params, _ = moved()
     weight = rng.normal(size=(64, 128, 3))
     grid = rng.normal(0, 0.3, params["gain.0"].shape)
-    _, found = gradient(
-        lambda x: dr.sum((made.decode(params | {"gain.0": x}) * tensor(weight)).array), tensor(grid)
-    )
+
+    def decoded(x):
+        return made.decode(params | {"gain.0": x})
 
     def total(values):
-        return (np.float64(made.decode(params | {"gain.0": tensor(values)}).numpy()) * weight).sum()
+        return (np.float64(decoded(tensor(values)).numpy()) * weight).sum()
+
+    _, found = gradient(lambda x: dr.sum((decoded(x) * tensor(weight)).array), tensor(grid))
 
     for _ in range(3):
         way = rng.normal(size=grid.shape)

@@ -47,15 +47,12 @@ def test_a_renderer_without_state_and_a_history_with_bad_steps(tmp_path, rng):
     assert renderer == {} and math.isnan(found.history[0]["loss"]) and found.history[1]["loss"] == math.inf
 
 
-def test_no_checkpoint_is_none(tmp_path, rng):
+def test_no_checkpoint_is_none_and_one_of_another_run_is_refused(tmp_path, rng):
     checkpoint.save(tmp_path, "what", *example(rng), PICTURE)
     for _ in range(2):
         checkpoint.remove(tmp_path)
     assert checkpoint.load(tmp_path, "what") is None and not list(tmp_path.iterdir())
     assert checkpoint.load(tmp_path / "nowhere", "what") is None
-
-
-def test_a_checkpoint_of_another_run_is_refused(tmp_path, rng):
     checkpoint.save(tmp_path, "what", *example(rng), PICTURE)
     with pytest.raises(InputError, match=r"checkpoint\.npz.*another configuration.*without --resume") as info:
         checkpoint.load(tmp_path, "other")

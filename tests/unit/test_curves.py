@@ -81,9 +81,6 @@ def test_axis_has_its_ends_and_the_powers_of_ten_between(values, labels):
 
 
 def test_losses_in_units_of_a_changing_noise_are_not_drawn():
-    rows = [
-        {"iteration": i, "loss": 9 + i, "data": 8 + i, "sigma": 1 / (1 + i), "residual": 0.1 / (1 + i)}
-        for i in range(3)
-    ]
-    svg = curves.curves_svg(rows)
+    rows = [{"iteration": i, "loss": 9 + i, "data": 8 + i, "sigma": 1 / (1 + i)} for i in range(3)]
+    svg = curves.curves_svg([row | {"residual": 0.1 * row["sigma"]} for row in rows])
     assert "residual 0.0333" in svg and "loss 1" not in svg and "data" not in svg

@@ -258,7 +258,6 @@ def test_jpeg(tmp_path):
 
 
 def damaged_files(folder, rng):
-    """Yield (name, words of the message) for files that must be refused."""
     p = planes(rng, size=(64, 128))
     raw = exr(folder / "whole.exr", **p).read_bytes()
     at = raw.index(b"dataWindow\0box2i\0") + 17 + 4

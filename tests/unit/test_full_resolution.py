@@ -49,14 +49,12 @@ def encoded(working, rows=ROWS, free=None, aureoles=True):
 
 
 def sent(made, params, v, light=0):
-    """Move a light to a direction."""
     params = {k: v.copy() for k, v in params.items()}
     params["turn"][light] = rotation_vector(made.lights.centres[light], v) / layers.SCALES["turn"]
     return params
 
 
 def carried(made, params, working, source, rows=ROWS, free=None):
-    """Return the edit at both resolutions."""
     params = {k: mi.TensorXf(v) for k, v in params.items()}
     edited = working.copy()
     edited[rows[0] : rows[0] + rows[1]] = made.decode(params).numpy()
@@ -321,7 +319,6 @@ def ratio(working, edited, source, rows=ROWS, free=None):
 
 
 def around(m):
-    """Most of a texel and its neighbours."""
     padded = np.pad(np.pad(m, ((1, 1), (0, 0), (0, 0)), mode="edge"), ((0, 0), (1, 1), (0, 0)), mode="wrap")
     shifts = [(r, c) for r in (0, 1, 2) for c in (0, 1, 2)]
     return np.max([padded[r : r + m.shape[0], c : c + m.shape[1]] for r, c in shifts], axis=0)

@@ -18,14 +18,12 @@ def tensors(params):
 
 
 def random(g, rng, size=1.0):
-    """Random parameters, each in its own unit."""
     scales = g.scales()
     drawn = {n: rng.standard_normal(v.shape).astype(np.float32) for n, v in g.init().items()}
     return {n: size * scales[n] * value for n, value in drawn.items()}
 
 
 def field(g, params, shape):
-    """Evaluate on the device: (rows, W, 3)."""
     return np.array(g.evaluate(tensors(params), g.prepare(shape))).T.reshape(*shape, 3)
 
 

@@ -11,7 +11,6 @@ from tests.oracles.plain import lookup
 
 
 def mitsuba_eval(image, d):
-    """Radiance of Mitsuba's envmap built from a bitmap, at directions (N, 3)."""
     scene = mi.load_dict({"type": "scene", "e": {"type": "envmap", "bitmap": mi.Bitmap(image)}})
     si = dr.zeros(mi.SurfaceInteraction3f)
     si.wi = -mi.Vector3f(*np.asarray(d, np.float32).T)

@@ -32,7 +32,6 @@ def sky(shape=SHAPE, sun=SUN, glow=True, peak=5000.0, level=1.0):
 
 
 def lamp(shape=SHAPE, sun=SUN):
-    """A lamp on a black background, and nothing else."""
     image = sky(shape, sun, glow=False)
     return np.where(image > 100, image, 0).astype(np.float32)
 
@@ -59,7 +58,6 @@ def core_of(made):
 
 
 def far_from(inside):
-    """All but a core and the texels next to it."""
     near = inside.copy()
     for row in (-1, 0, 1):
         for column in (-1, 0, 1):

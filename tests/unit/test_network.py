@@ -35,7 +35,6 @@ def points(rng, count):
 
 
 def gradient(network, params, x, seed_grad):
-    """Gradient of sum(seed_grad * y) through the AD graph."""
     leaves = {name: mi.TensorXf(value) for name, value in params.items()}
     dr.enable_grad(leaves)
     dr.backward(dr.sum((network(leaves, x, OMEGA) * seed_grad).array))
@@ -43,7 +42,6 @@ def gradient(network, params, x, seed_grad):
 
 
 def ours(params, x, seed_grad):
-    """The same gradient by the hand-written pass."""
     return gradient(siren.evaluate, params, x, seed_grad)
 
 

@@ -22,11 +22,9 @@ def told(feasible, target=0.2, white=1.0, lamps=0.0, **chosen):
     wanted = np.where(cover > 0, target, base)
     closest = base + feasible * (wanted - base)
     lit = np.where(cover > 0, white, 1.0) * np.ones(SHAPE)
-    reach = SimpleNamespace(
-        picture=closest,
-        residual=tonemap(wanted) - tonemap(closest),
-        share=feasible if np.isscalar(feasible) else 0.3,
-    )
+    share = feasible if np.isscalar(feasible) else 0.3
+    residual = tonemap(wanted) - tonemap(closest)
+    reach = SimpleNamespace(picture=closest, residual=residual, share=share)
     made = document({"strokes": [SQUARE, HELD], **chosen})
     painted = Request(base, wanted, cover)
     light = advice.Light(lit, np.full(SHAPE, lamps))

@@ -28,9 +28,8 @@ def lit(tmp_path_factory):
 
 def made(lit, file, **keys):
     ball, envmap, _ = lit
-    settings = config.Target(
-        kind="photo", file=file if isinstance(file, tuple) else str(file), spp=256, **{"align": False} | keys
-    )
+    named = {"file": file if isinstance(file, tuple) else str(file), "align": False}
+    settings = config.Target(kind="photo", spp=256, **named | keys)
     return target.make(config.Config(target=settings), ball, envmap)
 
 

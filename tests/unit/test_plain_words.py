@@ -30,12 +30,8 @@ IDIOMS = {
 }  # fmt: skip
 """Pattern, and what to write instead."""
 PACKAGE = sorted(ROOT.glob("envedit/**/*.py"))
-PAGES = [
-    *ROOT.glob("*.md"),
-    *ROOT.glob("docs/**/*.md"),
-    *ROOT.glob("experiments/*/README.md"),
-    *ROOT.glob("envedit/cli/paint/page/*.html"),
-]
+PAGES = [*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("experiments/*/README.md")]
+PAGES += ROOT.glob("envedit/cli/paint/page/*.html")
 
 
 def texts(file):

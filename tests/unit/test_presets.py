@@ -111,7 +111,7 @@ def test_dists_is_left_to_the_weights_for_a_siren_alone():
 # ---- targets -----------------------------------------------------------------------------------------------
 
 
-def test_a_target_file_changes_no_other_key():
+def test_a_target_is_a_file_or_a_turn_and_the_last_one_given_counts():
     for config in (cfg.loads(""), cfg.loads("[target]\nfile = 'b.exr'")):
         assert config.target.rotate_degrees == "auto"
     assert cfg.Target().degrees == 60 and cfg.Target(rotate_degrees=5).degrees == 5
@@ -125,9 +125,6 @@ def test_a_target_file_changes_no_other_key():
     assert painted.target.file == "/b.exr" and painted.target.rotate_degrees == 5
     (said,) = cfg.unused(painted)
     assert said.startswith("target.rotate_degrees: no effect: needs target.kind")
-
-
-def test_a_map_that_overrides_a_turn_replaces_it_and_the_other_way_round():
     turned = cfg.loads("[target]\nfile = 'b.exr'", overrides=["target.rotate_degrees=5"]).target
     assert turned.file == "" and turned.rotate_degrees == 5
     for still in ("0", "auto"):

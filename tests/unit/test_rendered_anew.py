@@ -34,7 +34,6 @@ def tell(sphere, picture):
 
 
 def eight_bit(picture):
-    """Return a picture as it comes back from a PNG."""
     shown = np.round(np.clip(picture, 0, 1) ** (1 / 2.2) * 255) / 255
     return inverse_tonemap(shown, "gamma").astype(np.float32)
 

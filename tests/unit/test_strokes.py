@@ -40,22 +40,18 @@ def painted(picture, tonemap="gamma", **stroke):
 # ---- where -------------------------------------------------------------------------------------------------
 
 TRIANGLE = [[0.1, 0.1], [0.83, 0.2], [0.4, 0.77]]
+BAR = {"points": [[0.2, 0.2], [0.7, 0.63]], "width": 0.05}
+ELBOW = {"points": [[0.2, 0.2], [0.8, 0.2], [0.8, 0.8]], "width": 0.1}
 AREAS = [
     ({"ellipse": [0.5, 0.5, 0.3, 0.11]}, math.pi * 0.3 * 0.11),
     ({"ellipse": [0.5, 0.5, 0.11, 0.3, 30]}, math.pi * 0.3 * 0.11),
     ({"polygon": TRIANGLE}, 0.5 * (0.73 * 0.67 - 0.3 * 0.1)),
     ({"rectangle": [0.213, 0.317, 0.651, 0.777]}, 0.438 * 0.46),
     ({"points": [[0.4, 0.4]], "width": 0.3}, math.pi * 0.15**2),
-    (
-        {"points": [[0.2, 0.2], [0.7, 0.63]], "width": 0.05},
-        0.05 * math.hypot(0.5, 0.43) + math.pi * 0.025**2,
-    ),
+    (BAR, 0.05 * math.hypot(0.5, 0.43) + math.pi * 0.025**2),
     # An elbow of a right angle: two bars and round ends, less the square that the bars share, and with the
     # joint's quarter of a disc.
-    (
-        {"points": [[0.2, 0.2], [0.8, 0.2], [0.8, 0.8]], "width": 0.1},
-        2 * 0.6 * 0.1 + math.pi * 0.05**2 + (math.pi / 4 - 1) * 0.05**2,
-    ),
+    (ELBOW, 2 * 0.6 * 0.1 + math.pi * 0.05**2 + (math.pi / 4 - 1) * 0.05**2),
 ]
 
 

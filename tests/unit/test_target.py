@@ -105,16 +105,13 @@ def a_stroke(**kwargs):
     return {"type": "shadow", "rectangle": [0.25, 0.25, 0.75, 0.75], "amount": 0.5, **kwargs}
 
 
-def test_strokes_lie_on_the_initial_rendering(ball, seen):
+def test_strokes_lie_on_the_initial_rendering_and_beside_it_are_refused(ball, seen):
     envmap, initial = seen
     made = target.make(asking(kind="strokes", strokes=(a_stroke(),)), ball, envmap)
     np.testing.assert_array_equal(made.initial, initial)
     np.testing.assert_allclose(made.picture[3:9, 4:12], 0.5 * initial[3:9, 4:12], rtol=1e-6)
     np.testing.assert_array_equal(made.picture[:3], initial[:3])
     assert made.envmap is None and made.asked == () and "1 strokes" in made.source
-
-
-def test_strokes_beside_the_picture_are_refused(ball, seen):
     with pytest.raises(InputError, match=r"target\.strokes"):
         beside = a_stroke(rectangle=[3, 3, 4, 4])
         target.make(asking(kind="strokes", strokes=(beside,)), ball, seen[0])
@@ -189,7 +186,6 @@ def pictured(ball):
 
 
 def shown_as_srgb(picture):
-    """Return 8-bit sRGB values by the standard's formula."""
     low = picture <= 0.0031308
     return np.round(255 * np.where(low, 12.92 * picture, 1.055 * picture ** (1 / 2.4) - 0.055)).astype("u1")
 

@@ -31,9 +31,8 @@ def test_codes_are_those_of_a_png(tmp_path, keys):
 
 def test_alpha_stays_and_orientation_is_undone(tmp_path):
     tags = [(274, "H", 1, 3, True)]
-    tifffile.imwrite(
-        tmp_path / "a.tif", CODES, photometric="rgb", extrasamples=["unassalpha"], extratags=tags
-    )
+    keys = {"photometric": "rgb", "extrasamples": ["unassalpha"], "extratags": tags}
+    tifffile.imwrite(tmp_path / "a.tif", CODES, **keys)
     np.testing.assert_array_equal(images.read_stored(tmp_path / "a.tif")[0], CODES[::-1, ::-1])
 
 

@@ -69,7 +69,6 @@ def test_views_are_scaled_each_by_itself(rng):
 
 
 def targets(asked, lit):
-    """Return the target on the whole film, and on the smaller one."""
     wanted = target.make(asked, lit, SKY)
     return wanted, working_size.worked_on(asked, lit, working_size.smaller(asked, lit), SKY, wanted)
 
@@ -113,18 +112,10 @@ def test_paint_keeps_its_change_and_its_weight():
 @pytest.mark.slow
 def test_an_edit_on_fewer_pixels_is_judged_at_full_size():
     """Nearly as good as one on all of them; what is shown has the size of the film."""
-    found = {}
-    for pixels in (24 * 24, 48 * 48):
-        tables = {
-            "input": {"width": 32},
-            "scene": {"file": "sphere", "width": 48},
-            "target": {"rotate_degrees": 60.0, "spp": 64},
-            "output": {"spp": 64},
-            "renderer": {"pixels": pixels},
-            "representation": {"turn": False},
-        }
-        found[pixels] = envedit.edit(tables, envmap=envedit.sunsky(32))
-    fewer, all_of_them = found.values()
+    tables = {"input": {"width": 32}, "scene": {"file": "sphere", "width": 48}, "output": {"spp": 64}}
+    tables |= {"target": {"rotate_degrees": 60.0, "spp": 64}, "representation": {"turn": False}}
+    sizes = [{"renderer": {"pixels": pixels}} for pixels in (24 * 24, 48 * 48)]
+    fewer, all_of_them = (envedit.edit(tables | size, envmap=envedit.sunsky(32)) for size in sizes)
     assert "solved on a picture of 24x24 pixels" in fewer.notes
     assert not any("solved on" in note for note in all_of_them.notes)
     assert {picture.shape for picture in fewer.renders.values()} == {(48, 48, 3)}

@@ -15,9 +15,8 @@ from tests.oracles.tiers import slow_but
 
 linux = pytest.mark.skipif(sys.platform != "linux", reason="memory of a process is read from /proc")
 
+
 # ---- the package -------------------------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 @linux
 @pytest.mark.parametrize(("what", "cases"), slow_but([

@@ -81,8 +81,6 @@ def check_resumed(path, folder, reference):
 
 
 # ---- killed at a file ------------------------------------------------------------------------------------
-
-
 @contextlib.contextmanager
 def killed_at(patch, number):
     """Kill at the n-th renaming of a temporary file, which is cut in half; yields what was renamed."""
@@ -205,8 +203,6 @@ def test_what_killed_writers_left_is_removed_and_nothing_else(tmp_path):
 
 
 # ---- no space, no folder ---------------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 def test_a_disk_that_is_full_at_a_file_is_told_and_costs_no_work(tmp_path, whole, monkeypatch, capsys):
     """Several files in turn, and the run goes on from its checkpoint as soon as there is room."""

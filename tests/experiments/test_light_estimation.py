@@ -37,8 +37,6 @@ def lights(*azimuths):
 
 
 # ---- Measures of pictures ----------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(("found", "true", "expected"), [
     # Squared errors 1 and 1 + 4, whose mean is 3; the best factor is 1; angles 0 and 90 degrees.
     (((1, 0, 0), (0, 1, 0)), ((2, 0, 0), (0, 0, 2)), {"rmse": 3, "si_rmse": 3, "angle": 45}),
@@ -61,8 +59,6 @@ def test_errors_are_those_worked_out_by_hand(found, true, expected):
 
 
 # ---- Measures of maps --------------------------------------------------------------------------------------
-
-
 def test_angle_between_brightest_directions():
     found, true = constant(), constant()
     found[4, 0], true[4, 4] = 2, 3  # a quarter of the horizon
@@ -94,8 +90,6 @@ def test_irradiance_in_stops_on_six_planes():
 
 
 # ---- Pictures ----------------------------------------------------------------------------------------------
-
-
 def test_the_median_of_positive_values_becomes_a_half():
     envmap = np.zeros((128, 256, 3), np.float32)
     envmap[:64] = [1, 2**2.4, 3**2.4]
@@ -123,11 +117,9 @@ def test_a_constant_map_gives_the_reflectance(mirror):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "direction, side",
-    [((0, -1, 0), (0, 0)), ((1, 0, 0), (1, 0)), ((-1, 0, 0), (-1, 0)), ((0, 0, 1), (0, 1))],
-    ids=["towards the camera", "right", "left", "above"],
-)
+@pytest.mark.parametrize("direction, side", [
+    ((0, -1, 0), (0, 0)), ((1, 0, 0), (1, 0)), ((-1, 0, 0), (-1, 0)), ((0, 0, 1), (0, 1)),
+], ids=["towards the camera", "right", "left", "above"])  # fmt: skip
 def test_directions_of_blender_are_where_its_camera_sees_them(direction, side, mirror):
     """Blender: +z is up, u = 1/2 - atan2(y, x) / 2 pi, v = 1/2 - asin(z) / pi; the camera looks along +y."""
     x, y, z = direction
@@ -217,8 +209,6 @@ def test_spheres_are_those_of_the_ground_truth(name, most):
 
 
 # ---- Tables ------------------------------------------------------------------------------------------------
-
-
 def test_our_rows_stand_beside_the_published_ones():
     of_spheres = {"rmse": 0.125, "si_rmse": 0.125, "normalised": 0.125, "angle": 0.5}
     rows = [{"kind": "edited", "sphere": name} | of_spheres for name in (*protocol.SPHERES, "mirror")]

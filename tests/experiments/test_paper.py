@@ -64,8 +64,6 @@ def text(out, made):
 
 
 # ---- the paper's numbers -----------------------------------------------------------------------------------
-
-
 def test_the_paper_s_numbers_are_complete_and_agree_with_each_other():
     counts = {name: {r: len(rows) for r, rows in parts.items()} for name, parts in PUBLISHED.items()}
     assert counts == {"table1": {None: 6}, "table2": {None: 4}, "table3": {0.0: 4, 0.5: 4, 1.0: 4}}
@@ -83,16 +81,9 @@ def test_the_paper_s_numbers_are_complete_and_agree_with_each_other():
 
 
 # ---- jobs --------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("name", "paper", "ours"),
-    [
-        ("table1", 9, 11),
-        ("table2", 9, 11),
-        ("table3", 9 * 4 * 3, 11 * 4 * 3),
-    ],
-)
+@pytest.mark.parametrize(("name", "paper", "ours"), [
+    ("table1", 9, 11), ("table2", 9, 11), ("table3", 9 * 4 * 3, 11 * 4 * 3),
+])  # fmt: skip
 def test_a_table_is_rows_by_maps_by_roughness(maps, build, name, paper, ours):
     made = build(name)
     abouts = [case.about for case, _ in made]
@@ -156,8 +147,6 @@ def test_roughness_and_overrides_reach_the_runs(maps, build):
 
 
 # ---- maps --------------------------------------------------------------------------------------------------
-
-
 def test_maps_are_found_by_name_the_smallest_file_of_each(tmp_path, monkeypatch):
     names = ["b_puresky_4k.hdr", "b_puresky_1k.exr", "a_b_puresky_16k.hdr", "a_b_puresky_2k.hdr"]
     names += ["b_puresky_1k.hdr", "MANIFEST.tsv", "c_puresky.hdr", "d_puresky_1k.hdr.part"]
@@ -190,8 +179,6 @@ def test_without_maps_an_error_says_where_they_come_from(build, tmp_path, monkey
 
 
 # ---- the command line --------------------------------------------------------------------------------------
-
-
 def test_usage(maps, tmp_path, capsys):
     options = ["paper", "run", "table1", "--out", str(tmp_path / "out")]
     only = ["--only", "ours-pixels-autumn", "ours-layers", "--dry-run"]

@@ -20,9 +20,8 @@ from experiments.harness import Case
 from experiments.tradeoff import cell, cost, experiment, plan
 from experiments.tradeoff.judge import Judge, without_noise
 
+
 # ---- what is run -------------------------------------------------------------------------------------------
-
-
 def toml_of(tables):
     return Case("x", config.presets.overlaid(plan.base("sky.hdr", "glossy"), tables)).job().toml
 
@@ -103,8 +102,6 @@ def test_a_run_that_fails_ends_its_cell(tmp_path, capfd):
 
 
 # ---- a run, measured ---------------------------------------------------------------------------------------
-
-
 def measured(folder, text):
     file = folder / "cost.json"
     command = [sys.executable, "-S", cost.__file__, file, sys.executable, "-S", "-c", text]
@@ -125,11 +122,9 @@ def test_cost_is_that_of_the_process(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "compiling, longest, calls",
-    [(0, 60, 1), (1, 60, 2), (9, 60, 2), (1, 0, 1)],
-    ids=["nothing", "once", "ever", "too long to repeat"],
-)
+@pytest.mark.parametrize("compiling, longest, calls", [
+    (0, 60, 1), (1, 60, 2), (9, 60, 2), (1, 0, 1),
+], ids=["nothing", "once", "ever", "too long to repeat"])  # fmt: skip
 def test_a_run_that_compiled_is_made_again(tmp_path, monkeypatch, compiling, longest, calls):
     made = []
 
@@ -145,8 +140,6 @@ def test_a_run_that_compiled_is_made_again(tmp_path, monkeypatch, compiling, lon
 
 
 # ---- how good a map is -------------------------------------------------------------------------------------
-
-
 def tiny(settings, **more):
     return Judge(settings, **({"spp": 32, "true_spp": 128, "width": 64, "film": 12} | more))
 
@@ -217,8 +210,6 @@ def test_error_without_noise_is_that_of_the_means(rng):
 
 
 # ---- ratios and tables -------------------------------------------------------------------------------------
-
-
 def one(setting, time, psnr, **more):
     spent = {"wall_s": time, "cpu_s": 1.5 * time, "peak_bytes": 1e8 * time}
     return {"setting": setting, "cost": spent, "judged": judgement(psnr) | more}

@@ -16,9 +16,8 @@ from envedit.solve import adam_loop
 from tests.oracles.matrix_renderer import WIDTH, arrays, case, same, sky, without_times
 from tests.oracles.plain import double, gradient, plain_display, single
 
+
 # ---- rows ------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(("first", "rows"), [(0, 3), (2, 3), (3, 3), (5, 1), (0, 6)])
 def test_rows_are_placed_and_all_others_keep_their_bits(first, rows, rng):
     original, crop = sky(rng), sky(rng)[:rows]
@@ -41,8 +40,6 @@ def test_gradient_reaches_the_placed_rows_only(first, rows, rng):
 
 
 # ---- objective -------------------------------------------------------------------------------------------
-
-
 def test_objective_is_the_weighted_sum_of_its_losses(rng):
     picture, rendering = (rng.random((12, 14, 3)).astype(np.float32) for _ in range(2))
     original, crop = sky(rng)[:3], sky(rng)[:3]
@@ -101,8 +98,6 @@ def test_pixels_without_weight_do_not_count(rng):
 
 
 # ---- the loop --------------------------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["pixels", "log-pixels"])
 def test_edit_finds_the_map_behind_the_picture(kind, rng):
@@ -202,8 +197,6 @@ def test_what_an_observer_raises_ends_the_run(rng):
 
 
 # ---- steps that are not finite ---------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("value", [math.nan, math.inf])
 def test_bad_renderings_are_counted_taken_back_and_halve_the_rate(value, rng):
     """The step that led to a bad rendering is undone, and good steps win the rate back, ten for a halving."""
@@ -227,8 +220,6 @@ def test_nineteen_bad_steps_in_a_row_are_survived(rng):
 
 
 # ---- continuing, repeating, cost -------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("cut", [1, 4, 7, 10, 15])
 def test_a_run_that_is_cut_and_continued_gives_the_same_bits(cut, rng):
     """Also where the next step is a bad one, and the step before the cut has to be taken back."""

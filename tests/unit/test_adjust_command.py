@@ -98,16 +98,13 @@ def test_the_command_keeps_format_and_colour_space_and_writes_a_backplate(rng, c
     np.testing.assert_allclose(plate.stored, 0.5 * before.stored, rtol=2e-3, atol=1e-3)
 
 
-@pytest.mark.parametrize(
-    ("options", "code", "says"),
-    [
-        ([], 2, "nothing to adjust: give one of --turn"),
-        (["--blur", "1", "--out", "sky.hdr"], 2, "sky.hdr: is read by this command"),
-        (["--blur", "1", "--background-blur", "2"], 2, "need --background FILE"),
-        (["--blur", "1", "--out", "a.exr", "--background", "a.exr"], 2, "where the map itself goes"),
-        (["--exposure", "100", "--out", "a.exr"], 5, "leaves float32"),
-    ],
-)
+@pytest.mark.parametrize(("options", "code", "says"), [
+    ([], 2, "nothing to adjust: give one of --turn"),
+    (["--blur", "1", "--out", "sky.hdr"], 2, "sky.hdr: is read by this command"),
+    (["--blur", "1", "--background-blur", "2"], 2, "need --background FILE"),
+    (["--blur", "1", "--out", "a.exr", "--background", "a.exr"], 2, "where the map itself goes"),
+    (["--exposure", "100", "--out", "a.exr"], 5, "leaves float32"),
+])  # fmt: skip
 def test_bad_options_are_one_line(options, code, says, rng, tmp_path, capsys, here):
     images.write_hdr("sky.hdr", 1e10 * sunny(rng))
     assert adjust.main(["sky.hdr", *options]) == code

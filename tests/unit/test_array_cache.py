@@ -52,8 +52,6 @@ def test_another_key_finds_nothing_and_a_new_entry_takes_the_place_of_the_old(tm
 
 
 # ---- files that are no good ------------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 def test_no_damage_to_a_single_byte_goes_unseen(tmp_path, rng):
     """Every byte of a small file is changed in turn: nothing, or the same arrays where it was padding."""
@@ -134,8 +132,6 @@ def test_a_full_disk_leaves_what_was_there(tmp_path, rng, monkeypatch):
 
 
 # ---- the bound -------------------------------------------------------------------------------------------
-
-
 def filled(folder, count, used):
     """Store entries of 10 kB and say when each was used last, in seconds; returns cache and paths."""
     cache, paths = DiskCache(folder, most_bytes=35_000), []
@@ -192,8 +188,6 @@ def test_what_a_killed_writer_left_is_deleted_but_not_what_is_being_written(tmp_
 
 
 # ---- entries and folders of others -------------------------------------------------------------------------
-
-
 def entry(text, arrays, description=None):
     """An entry with right digests, made without the cache; another description where one is given."""
     head = array_cache._header(text, arrays)

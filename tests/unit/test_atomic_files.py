@@ -23,19 +23,16 @@ def test_a_file_is_replaced_whole(tmp_path):
     assert path.read_bytes() == b"newer" and os.listdir(tmp_path) == [path.name]
 
 
-@pytest.mark.parametrize(
-    "raised, seen, says",
-    [
-        (
-            RuntimeError("Cannot open x.tmp: Too many links."),
-            InputError,
-            r"a: cannot be written \(Too many links\)",
-        ),
-        (ValueError("bad header"), InputError, r"a: cannot be written \(bad header\)"),
-        (NumericalError("texel 3 is NaN"), NumericalError, "^texel 3 is NaN$"),
-        (KeyboardInterrupt(), KeyboardInterrupt, "^$"),
-    ],
-)
+@pytest.mark.parametrize("raised, seen, says", [
+    (
+        RuntimeError("Cannot open x.tmp: Too many links."),
+        InputError,
+        r"a: cannot be written \(Too many links\)",
+    ),
+    (ValueError("bad header"), InputError, r"a: cannot be written \(bad header\)"),
+    (NumericalError("texel 3 is NaN"), NumericalError, "^texel 3 is NaN$"),
+    (KeyboardInterrupt(), KeyboardInterrupt, "^$"),
+])  # fmt: skip
 def test_a_failure_keeps_the_old_file(tmp_path, raised, seen, says):
     path = tmp_path / "a"
     path.write_bytes(b"old")

@@ -164,8 +164,6 @@ def test_a_channel_that_is_black_in_the_sky_does_not_burst_below_it(kind, channe
 
 
 # ---- in layers ---------------------------------------------------------------------------------------------
-
-
 def moved(sun=(24, 20)):
     image = mirror((64, 128), sun)
     made = Layers.of(image, horizon="mirror")

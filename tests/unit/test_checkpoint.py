@@ -90,9 +90,6 @@ def test_other_files_of_that_name_are_refused(tmp_path):
             checkpoint.load(tmp_path, "what")
 
 
-# ---- digest ----------------------------------------------------------------------------------------------
-
-
 def test_digest_knows_what_decides_the_result(rng):
     settings, pixels = config.Config(), rng.random((4, 8, 3)).astype(np.float32)
     changed = pixels.copy()
@@ -140,17 +137,10 @@ def test_every_kind_of_damage_to_the_archive_is_told(tmp_path, offset, value):
     assert len(str(info.value)) - len(str(path)) < 300
 
 
-@pytest.mark.parametrize(
-    ("state", "picture", "parameter"),
-    [
-        (State(step=-1), 0.0, 0.0),
-        (State(step="2"), 0.0, 0.0),
-        (State(slowdown=0), 0.0, 0.0),
-        (State(history=[5]), 0.0, 0.0),
-        (State(), np.nan, 0.0),
-        (State(), 0.0, np.inf),
-    ],
-)
+@pytest.mark.parametrize(("state", "picture", "parameter"), [
+    (State(step=-1), 0.0, 0.0), (State(step="2"), 0.0, 0.0), (State(slowdown=0), 0.0, 0.0),
+    (State(history=[5]), 0.0, 0.0), (State(), np.nan, 0.0), (State(), 0.0, np.inf),
+])  # fmt: skip
 def test_a_right_digest_with_a_wrong_state_is_told(tmp_path, state, picture, parameter):
     kept = np.full((2, 4, 3), picture, np.float32)
     checkpoint.save(tmp_path, "what", state, {"a": np.array([parameter])}, {}, kept)

@@ -24,9 +24,6 @@ def help_of(capsys, *arguments):
     return out
 
 
-# ---- help --------------------------------------------------------------------------------------------------
-
-
 def test_every_command_has_an_example_and_examples_name_things_that_exist(capsys):
     first, said = help_of(capsys), {name: help_of(capsys, name) for name in cli.COMMANDS}
     assert all(f"  {name} " in first for name in cli.COMMANDS)
@@ -38,9 +35,6 @@ def test_every_command_has_an_example_and_examples_name_things_that_exist(capsys
     own = "edit.toml", "scene.xml"  # files of the reader's
     named = [call[2] for call in calls if call[1] == "run" and call[2] not in own]
     assert named and all(name in shipped.configurations() for name in named)
-
-
-# ---- usage errors ------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -71,9 +65,6 @@ def test_python_m_envedit_is_the_command(arguments, code):
     assert done.returncode == code and "Traceback" not in done.stderr
     assert done.stdout == (f"envedit {envedit.__version__}\n" if code == 0 else "")
     assert code == 0 or "envedit" in done.stderr
-
-
-# ---- configurations by name --------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", shipped.configurations())
@@ -109,15 +100,12 @@ def test_a_file_goes_before_a_shipped_name_and_a_folder_does_not(here):
     assert settings.output.dir == str(here / "quickstart_out")
 
 
-@pytest.mark.parametrize(
-    ("wrong", "says"),
-    [
-        ("quikstart", "did you mean the shipped quickstart?"),
-        ("quickstart.toml", "did you mean the shipped quickstart?"),
-        ("edits/move_shadows", "did you mean the shipped edits/move_shadow?"),
-        ("my.toml", "to write one: envedit init"),
-    ],
-)
+@pytest.mark.parametrize(("wrong", "says"), [
+    ("quikstart", "did you mean the shipped quickstart?"),
+    ("quickstart.toml", "did you mean the shipped quickstart?"),
+    ("edits/move_shadows", "did you mean the shipped edits/move_shadow?"),
+    ("my.toml", "to write one: envedit init"),
+])  # fmt: skip
 def test_a_configuration_that_is_not_there(wrong, says, here, capsys):
     assert run.main([wrong]) == 2
     assert capsys.readouterr().err == f"envedit: {wrong}: no such configuration file; {says}\n"

@@ -49,15 +49,12 @@ def test_exr_mixed_types_layers_and_parts(tmp_path, rng):
     np.testing.assert_array_equal(images.read(tmp_path / "p.exr")[0], stacked(p))
 
 
-@pytest.mark.parametrize(
-    ("parts", "channels", "label"),
-    [
-        (("ViewLayer.AO", "ViewLayer.Combined"), ("", ""), "ViewLayer.Combined"),
-        (("ViewLayer.Combined_Key", "ViewLayer.Combined"), ("", ""), "ViewLayer.Combined"),
-        (("one", "two"), ("diffuse.", "beauty."), "two.beauty"),
-        (("View.AO", "View.Combined"), ("View.AO.", "View.Combined."), "View.Combined"),
-    ],
-)
+@pytest.mark.parametrize(("parts", "channels", "label"), [
+    (("ViewLayer.AO", "ViewLayer.Combined"), ("", ""), "ViewLayer.Combined"),
+    (("ViewLayer.Combined_Key", "ViewLayer.Combined"), ("", ""), "ViewLayer.Combined"),
+    (("one", "two"), ("diffuse.", "beauty."), "two.beauty"),
+    (("View.AO", "View.Combined"), ("View.AO.", "View.Combined."), "View.Combined"),
+])  # fmt: skip
 def test_the_part_of_the_picture_is_read(parts, channels, label, tmp_path, rng):
     """It is named so, by part or layer; every layer with colour is told."""
     p = planes(rng)
@@ -146,19 +143,16 @@ def test_radiance_header(tmp_path, rng):
         images.read(rgbe_file(tmp_path / "x.hdr", q, size="+Y 4 +X 8"))
 
 
-@pytest.mark.parametrize(
-    ("header", "told"),
-    [
-        ("EXPOSURE=2\nEXPOSURE=4.0\n", "EXPOSURE=8 in its header is not undone"),
-        ("EXPOSURE=2\nEXPOSURE=0.5\n", None),
-        ("EXPOSURE=2\nEXPOSURE=x\n", "EXPOSURE=2, x in its header"),
-        ("COLORCORR=1 2 1\nCOLORCORR=1 2 0.5\n", "COLORCORR=1 4 0.5 in its header"),
-        ("GAMMA=2.2\n", "GAMMA=2.2 in its header is not undone"),
-        ("GAMMA=1\nPRIMARIES=0 0 0 0 0 0 0 0\n", None),  # what some programs write into every file
-        ("PRIMARIES=0.64 0.33 0.30 0.60 0.15 0.06 0.3127 0.3290\n", None),
-        ("PRIMARIES=.713 .293 .165 .830 .128 .044 .32168 .33767\n", "converted from ACEScg to Rec. 709"),
-    ],
-)
+@pytest.mark.parametrize(("header", "told"), [
+    ("EXPOSURE=2\nEXPOSURE=4.0\n", "EXPOSURE=8 in its header is not undone"),
+    ("EXPOSURE=2\nEXPOSURE=0.5\n", None),
+    ("EXPOSURE=2\nEXPOSURE=x\n", "EXPOSURE=2, x in its header"),
+    ("COLORCORR=1 2 1\nCOLORCORR=1 2 0.5\n", "COLORCORR=1 4 0.5 in its header"),
+    ("GAMMA=2.2\n", "GAMMA=2.2 in its header is not undone"),
+    ("GAMMA=1\nPRIMARIES=0 0 0 0 0 0 0 0\n", None),  # what some programs write into every file
+    ("PRIMARIES=0.64 0.33 0.30 0.60 0.15 0.06 0.3127 0.3290\n", None),
+    ("PRIMARIES=.713 .293 .165 .830 .128 .044 .32168 .33767\n", "converted from ACEScg to Rec. 709"),
+])  # fmt: skip
 def test_radiance_marks(header, told, tmp_path, rng):
     q = rng.integers(128, 256, (4, 8, 4)).astype(np.uint8).tobytes()
     expected, _ = images.read(rgbe_file(tmp_path / "p.hdr", q))
@@ -236,15 +230,12 @@ def test_the_curve_that_a_png_says(gamma, dtype, tmp_path, rng):
     assert "gAMA" not in info["warnings"][0]
 
 
-@pytest.mark.parametrize(
-    ("kind", "data", "odd"),
-    [
-        (b"iCCP", b"ICC\0\0" + zlib.compress(b"GIMP built-in Linear sRGB"), True),
-        (b"iCCP", b"ICC\0\0" + zlib.compress(b"sRGB IEC61966-2.1"), False),
-        (b"cICP", b"\x09\x10\0\1", True),  # Rec. 2020, PQ
-        (b"cICP", b"\1\r\0\1", False),
-    ],
-)
+@pytest.mark.parametrize(("kind", "data", "odd"), [
+    (b"iCCP", b"ICC\0\0" + zlib.compress(b"GIMP built-in Linear sRGB"), True),
+    (b"iCCP", b"ICC\0\0" + zlib.compress(b"sRGB IEC61966-2.1"), False),
+    (b"cICP", b"\x09\x10\0\1", True),  # Rec. 2020, PQ
+    (b"cICP", b"\1\r\0\1", False),
+])  # fmt: skip
 def test_a_profile_that_is_not_srgb_is_told_of_maps(kind, data, odd, tmp_path):
     path = png(tmp_path / "a.png", np.full((4, 8, 3), 188, np.uint8))
     _, info = images.load_envmap(with_chunk(path, kind, data))

@@ -41,8 +41,6 @@ def facts(fitted):
 
 
 # ---- normalisation (Eq. 1-3) -----------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("value", [0.0, 1e-30, 0.3, 65504.0, 1e38])
 def test_constant_map_lies_in_the_middle_of_a_range_of_one(value):
     image = np.full((2, 4, 3), value, np.float32)
@@ -73,8 +71,6 @@ def test_normalisation_is_equation_1_between_ends_that_are_left_free(headroom, r
 
 
 # ---- objective (Eq. 4) -----------------------------------------------------------------------------------
-
-
 def rows(image):
     return np.ascontiguousarray(np.asarray(image).reshape(-1, 3))
 
@@ -138,8 +134,6 @@ def test_objective_of_the_perturbation_is_the_ssim_alone(rng):
 
 
 # ---- adversarial weight perturbation (Eq. 5) -------------------------------------------------------------
-
-
 def step_of_perturbation(rng, gamma=0.01, lr=1e-4):
     image = sky(rng)
     params, x = siren.init(0, 16, 2, 30.0), siren.coordinates(16, 32)
@@ -194,8 +188,6 @@ def test_perturbation_by_what_is_zero_or_not_finite_is_none(rng):
 
 
 # ---- the fit ---------------------------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 def test_small_fit_reaches_a_good_picture(rng):
     image = sky(rng)
@@ -338,8 +330,6 @@ def test_every_texel_belongs_to_one_grid_with_its_point(height, width, stride, c
 
 
 # ---- schedules -------------------------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("gamma", [0.0, 0.01])
 @pytest.mark.parametrize("stride", [1, 2])
@@ -354,8 +344,7 @@ def test_no_new_kernel_after_every_grid_had_a_turn(stride, gamma, rng):
 
 
 @pytest.mark.parametrize(("schedule", "expected"), [
-    ("constant", [1, 1, 1, 1, 1]),
-    ("cosine", [1, 0.853553, 0.5, 0.146447, 0]),
+    ("constant", [1, 1, 1, 1, 1]), ("cosine", [1, 0.853553, 0.5, 0.146447, 0]),
     ("warm-restarts", [1, 0.5, 1, 0.5, 1]),
 ])  # fmt: skip
 def test_learning_rate_follows_the_schedule(schedule, expected):
@@ -365,8 +354,6 @@ def test_learning_rate_follows_the_schedule(schedule, expected):
 
 
 # ---- fits on disk ----------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("black", [False, True])
 def test_a_fit_is_read_back_as_it_was_and_a_damaged_one_made_again(tmp_path, black, rng):
     image = sky(rng) * (not black)

@@ -83,8 +83,6 @@ def sunny():
 
 
 # ---- layers: what stays ------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("band", [1 << 21, 700, 5120])
 def test_no_edit_is_the_source_bit_for_bit(sunny, band, monkeypatch):
     monkeypatch.setattr(texel_maps, "BAND_TEXELS", band)
@@ -148,8 +146,6 @@ def test_texels_far_from_a_moved_light_without_glow_keep_their_bits():
 
 
 # ---- layers: what changes ----------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("value", [-1.0, 0.7])
 def test_an_even_gain_is_the_formula(value):
     source = sky(128, 256, sun=None)
@@ -310,8 +306,6 @@ def test_what_is_not_finite_is_refused(sunny):
 
 
 # ---- other representations ---------------------------------------------------------------------------------
-
-
 def ratio(working, edited, source, rows=ROWS, free=None):
     result = full_resolution.carry(Pixels(), {}, working, edited, source, Rows(*rows, len(working)), free)
     assert result.dtype == np.float32 and np.isfinite(result).all() and (result >= 0).all()
@@ -427,8 +421,6 @@ def test_a_source_that_is_not_larger_takes_the_edited_map(shape, rng):
 
 
 # ---- rows below the horizon that follow --------------------------------------------------------------------
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("finer", [2, 4])
 @pytest.mark.parametrize("kind", ["mirror", "keep"])

@@ -55,9 +55,6 @@ def poles(share):
     return (0, -1) if share == 1 else (0,)
 
 
-# ---- grids -------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("cycles, share", [(8, 1.0), (16, 0.5), (32, 0.25)])
 def test_grids_double_and_are_as_fine_in_elevation_as_in_azimuth(cycles, share):
     g = gain.GridGain(cycles, share)
@@ -85,9 +82,6 @@ def test_hats_are_a_partition_of_unity(cycles, share, shape):
         np.testing.assert_allclose(field(g, ones, shape), 1, rtol=1e-6)
 
 
-# ---- the field ---------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("cycles, share", GAINS)
 @pytest.mark.parametrize("shape", SHAPES)
 def test_field_is_the_interpolation_of_its_grids(cycles, share, shape, rng):
@@ -113,9 +107,6 @@ def test_gain_is_bounded_and_only_at_its_bounds(rng):
     free = sum(interpolated(grid, shape, poles(1)) for grid in params.values())
     assert (np.abs(free) > gain.MOST).any() and (np.abs(free) < gain.MOST).any()
     np.testing.assert_allclose(field(g, params, shape), np.clip(free, -12, 12), atol=3e-5)
-
-
-# ---- derivatives -------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("cycles, share", GAINS)
@@ -148,9 +139,6 @@ def test_finer_grids_start_at_nothing_and_move_as_far_as_they_are_known(rng):
     assert unit.shape == (*size, 3) and np.allclose(unit, gain.DETAIL * known[..., None])
     params = {k: rng.normal(size=v.shape).astype(np.float32) for k, v in coarse.init().items()}
     assert np.array_equal(*(field(g, g.init() | params, (16, 64)) for g in (coarse, fine)))
-
-
-# ---- where nodes are ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("share", "top"), [(1.0, True), (0.5, True), (0.5, False)])

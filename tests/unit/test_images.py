@@ -12,8 +12,6 @@ from envedit.core.errors import ConfigError, InputError, NumericalError
 from envedit.images import images
 from tests.oracles.builders import exr, planes, stacked
 
-# ---- reading -----------------------------------------------------------------------------------------------
-
 
 def test_real_maps(data):
     for name in ("puresky/kloofendal_48d_partly_cloudy_puresky_1k.hdr", "hdri/venice_sunset_1k.hdr"):
@@ -25,10 +23,9 @@ def test_real_maps(data):
         np.testing.assert_allclose(*energy, rtol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("size", "panorama"),
-    [((8, 16), True), ((8, 17), True), ((8, 15), True), ((8, 18), False), ((9, 9), False), ((9, 16), False)],
-)
+@pytest.mark.parametrize(("size", "panorama"), [
+    ((8, 16), True), ((8, 17), True), ((8, 15), True), ((8, 18), False), ((9, 9), False), ((9, 16), False),
+])  # fmt: skip
 @pytest.mark.parametrize("ending", ["exr", "png"])
 def test_a_panorama_is_twice_as_wide_as_high_to_a_texel(size, panorama, ending, tmp_path, rng):
     file = tmp_path / f"a.{ending}"
@@ -94,18 +91,15 @@ def test_load_envmap_refusals(tmp_path):
     assert not found.any() and "black" in info["warnings"][0]
 
 
-@pytest.mark.parametrize(
-    ("height", "width", "what"),
-    [
-        (192, 32, "the shape of a cube map in a column; convert it to lat-long"),
-        (32, 192, "the shape of a cube map in a row; convert it to lat-long"),
-        (64, 48, "the shape of a cube map as a vertical cross; convert it to lat-long"),
-        (48, 64, "the shape of a cube map as a horizontal cross; convert it to lat-long"),
-        (16, 16, "the shape of a mirror ball, an angular map or a fisheye; convert it to lat-long"),
-        (16, 64, "the shape of half a sphere; add the rows of the other half"),
-        (17, 64, "crop or resize it"),
-    ],
-)
+@pytest.mark.parametrize(("height", "width", "what"), [
+    (192, 32, "the shape of a cube map in a column; convert it to lat-long"),
+    (32, 192, "the shape of a cube map in a row; convert it to lat-long"),
+    (64, 48, "the shape of a cube map as a vertical cross; convert it to lat-long"),
+    (48, 64, "the shape of a cube map as a horizontal cross; convert it to lat-long"),
+    (16, 16, "the shape of a mirror ball, an angular map or a fisheye; convert it to lat-long"),
+    (16, 64, "the shape of half a sphere; add the rows of the other half"),
+    (17, 64, "crop or resize it"),
+])  # fmt: skip
 def test_what_is_not_lat_long_is_named(height, width, what, tmp_path):
     path = exr(tmp_path / "a.exr", **{c: np.ones((height, width), np.float32) for c in "RGB"})
     with pytest.raises(InputError, match=rf"a.exr: .* is 2:1, this is {width} x {height}[,;] {what}$"):
@@ -131,9 +125,6 @@ def test_a_texel_of_rounding_is_resampled(height, width, working, rng):
     assert f"{width} x {height} texels are not 2:1: resampled to {2 * height} x {height}" in info["warnings"]
     flux = [i.sum(1, dtype=np.float64).T @ latlong.solid_angles(*i.shape[:2]) for i in (sky, found)]
     np.testing.assert_allclose(flux[0], flux[1], rtol=0.02)
-
-
-# ---- writing -----------------------------------------------------------------------------------------------
 
 
 def test_write_exr_round_trip(tmp_path, rng):

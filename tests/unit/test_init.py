@@ -57,16 +57,13 @@ def test_nothing_is_overwritten(kind, here, capsys):
     assert kind != "file" or out.read_text() == "mine"
 
 
-@pytest.mark.parametrize(
-    ("arguments", "says"),
-    [
-        (["sphre"], ["SCENE: got sphre: no such file", "sphere, statue", "did you mean sphere?"]),
-        (["my.xml"], ["SCENE: got my.xml: no such file", "sphere, statue", "check the path"]),
-        (["--envmap", "sky.hdr"], ["--envmap: got sky.hdr: no such file", "scene, sunsky"]),
-        (["--envmap", "sunski"], ["did you mean sunsky?"]),
-        (["--out", "none/edit.toml"], ["none/edit.toml: cannot be written", "folder does not exist"]),
-    ],
-)
+@pytest.mark.parametrize(("arguments", "says"), [
+    (["sphre"], ["SCENE: got sphre: no such file", "sphere, statue", "did you mean sphere?"]),
+    (["my.xml"], ["SCENE: got my.xml: no such file", "sphere, statue", "check the path"]),
+    (["--envmap", "sky.hdr"], ["--envmap: got sky.hdr: no such file", "scene, sunsky"]),
+    (["--envmap", "sunski"], ["did you mean sunsky?"]),
+    (["--out", "none/edit.toml"], ["none/edit.toml: cannot be written", "folder does not exist"]),
+])  # fmt: skip
 def test_what_is_not_there(arguments, says, here, capsys):
     assert init.main(arguments) == 3
     out, err = capsys.readouterr()
@@ -84,15 +81,12 @@ def uncommented(text, *keys):
     return text
 
 
-@pytest.mark.parametrize(
-    "keys",
-    [
-        [("kind", '"image"'), ("file", '"paint_me.png"')],
-        [("kind", '"strokes"'), ("strokes", "[{")],
-        [("azimuth", "90.0"), ("elevation", "35.0")],
-        [("parameters", "{ roughness")],
-    ],
-)
+@pytest.mark.parametrize("keys", [
+    [("kind", '"image"'), ("file", '"paint_me.png"')],
+    [("kind", '"strokes"'), ("strokes", "[{")],
+    [("azimuth", "90.0"), ("elevation", "35.0")],
+    [("parameters", "{ roughness")],
+])  # fmt: skip
 def test_what_stands_in_comments_loads_too(keys):
     assert init.main([]) == 0
     before, after = Path("edit.toml").read_text().split("[target]")

@@ -64,15 +64,10 @@ def test_a_mask_counts_too_and_is_kept_around_nothing_but_noise(rng):
     assert initialization.trusted(MAP, recordings, asked) == (asked, [])
 
 
-@pytest.mark.parametrize(
-    "cycles, coverage, spp, wanted",
-    [
-        ("auto", None, 256, (256, 32)),
-        ("auto", None, 16, (16, 16)),
-        (12, None, 256, (256, None)),
-        ("auto", MAP, 256, (256, None)),
-    ],
-)
+@pytest.mark.parametrize("cycles, coverage, spp, wanted", [
+    ("auto", None, 256, (256, 32)), ("auto", None, 16, (16, 16)), (12, None, 256, (256, None)),
+    ("auto", MAP, 256, (256, None)),
+])  # fmt: skip
 def test_a_second_recording_is_made_where_detail_is_asked_about(cycles, coverage, spp, wanted, monkeypatch):
     asked = tracing(monkeypatch, [])
     found = recorded({"representation": {"cycles": cycles}}, Traced(spp), coverage)
@@ -82,18 +77,15 @@ def test_a_second_recording_is_made_where_detail_is_asked_about(cycles, coverage
     assert bool(found.notes) == (second is not None)
 
 
-@pytest.mark.parametrize(
-    "octaves, renderer, spp, size, wanted",
-    [
-        (["one"], {}, 64, 256, 256),  # 0.8 of the 2 GB
-        (["one"], {"memory_gb": "auto"}, 64, 256, 256),
-        (["one"], {"memory_gb": 1.0}, 64, 256, 128),
-        (["one"], {}, 16, 1024, None),  # more do not fit
-        (["one"], {}, 256, 128, None),
-        (["one"], {"spp": 64}, 64, 256, None),  # what was asked for is taken
-        ([], {}, 64, 256, None),
-    ],
-)
+@pytest.mark.parametrize("octaves, renderer, spp, size, wanted", [
+    (["one"], {}, 64, 256, 256),  # 0.8 of the 2 GB
+    (["one"], {"memory_gb": "auto"}, 64, 256, 256),
+    (["one"], {"memory_gb": 1.0}, 64, 256, 128),
+    (["one"], {}, 16, 1024, None),  # more do not fit
+    (["one"], {}, 256, 128, None),
+    (["one"], {"spp": 64}, 64, 256, None),  # what was asked for is taken
+    ([], {}, 64, 256, None),
+])  # fmt: skip
 def test_where_detail_is_told_a_large_picture_gets_more_samples(
     octaves, renderer, spp, size, wanted, monkeypatch
 ):

@@ -19,8 +19,6 @@ from envedit.core import shipped
 from envedit.core.errors import ConfigError
 from tests.oracles import ROOT
 
-# ---- JSON Schema, draft 7 ----------------------------------------------------------------------------------
-
 
 def accepts(schema, value):
     return jsonschema.Draft7Validator(schema).is_valid(value)
@@ -86,27 +84,21 @@ def test_shipped_configurations_and_resolved_ones_fit_the_schema():
         assert accepts(SCHEMA, tomllib.loads(config.to_toml(config.from_dict(made, preset=preset))))
 
 
-@pytest.mark.parametrize(
-    "table",
-    [
-        {"inptu": {}},
-        {"input": {"widht": 64}},
-        {"input": 3},
-        {"input": {"lights": [{"azimuth": 3}]}},
-        {"input": {"lights": [{"light": 9}]}},
-        {"target": {"strokes": [{"amount": 1}]}},
-        {"target": {"strokes": [{"type": "shado"}]}},
-        {"target": {"strokes": [{"type": "light", "colour": [1, 1, 1]}]}},
-        {"target": {"strokes": [{"type": "light", "polygon": [[0, 0], [1, 1]]}]}},
-    ],
-)
+@pytest.mark.parametrize("table", [
+    {"inptu": {}},
+    {"input": {"widht": 64}},
+    {"input": 3},
+    {"input": {"lights": [{"azimuth": 3}]}},
+    {"input": {"lights": [{"light": 9}]}},
+    {"target": {"strokes": [{"amount": 1}]}},
+    {"target": {"strokes": [{"type": "shado"}]}},
+    {"target": {"strokes": [{"type": "light", "colour": [1, 1, 1]}]}},
+    {"target": {"strokes": [{"type": "light", "polygon": [[0, 0], [1, 1]]}]}},
+])  # fmt: skip
 def test_the_schema_refuses_what_a_configuration_refuses(table):
     assert not accepts(SCHEMA, table)
     with pytest.raises(ConfigError):
         config.from_dict(table)
-
-
-# ---- the page of all keys ----------------------------------------------------------------------------------
 
 
 def test_the_page_is_what_is_generated(capsys):
@@ -121,40 +113,34 @@ def test_the_page_is_what_is_generated(capsys):
     assert command.main([]) == 0 and json.loads(capsys.readouterr().out) == SCHEMA
 
 
-# ---- keys that change nothing ------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("tables", "solver", "named"),
-    [
-        ({"representation": {"hidden": 64, "depth": 2}}, None, ["depth, representation.hidden: no effect"]),
-        ({"representation": {"hidden": 64, "kind": "siren"}}, "adam", []),
-        ({"representation": {"kind": "siren", "cycles": 3}}, "adam", ['= "layers", got "siren"']),
-        ({"fit": {"lr": 1}}, None, ["fit.lr: no effect: needs representation.kind"]),
-        ({"fit": {"restart_period": 7}, "representation": {"kind": "siren"}}, "adam", ["needs fit.schedule"]),
-        ({"fit": {"awp_lr": 1, "awp_gamma": 0}, "representation": {"kind": "siren"}}, None, ["fit.awp_lr"]),
-        ({"optimizer": {"lr": 0.1, "schedule": "constant"}, "loss": {"ssim": 1}}, "adam", []),
-        (
-            {
-                "optimizer": {"lr": 0.1, "schedule": "constant"},
-                "loss": {"ssim": 1},
-                "renderer": {"refresh": 5},
-            },
-            "gauss-newton",
-            ["loss.ssim, optimizer.lr, optimizer.schedule, renderer.refresh: no effect with"],
-        ),
-        ({"loss": {"ssim": 0.1}, "optimizer": {"lr": "auto"}}, "gauss-newton", []),  # the defaults
-        ({"renderer": {"kind": "path", "memory_gb": 3}}, "adam", ['got "path"']),
-        ({"input": {"envmap": "a.exr", "azimuth": 3}}, None, ["azimuth: no effect: needs input.envmap"]),
-        ({"input": {"azimuth": 3}}, None, []),
-        ({"input": {"lights": LIGHTS, "horizon": "keep", "rows": "upper"}}, None, []),  # they use the horizon
-        ({"input": {"rows": "upper", "horizon": "keep"}}, None, ["horizon: no effect: needs input.rows"]),
-        ({"target": {"paint": 2}}, None, ["target.paint: no effect: needs target.kind"]),
-        ({"perceptual": {"vgg": "a", "dists": "b"}}, None, ["perceptual.dists, perceptual.vgg: no effect"]),
-        ({"target": {"kind": "none"}, "optimizer": {"iterations": 3}}, None, ['other than "none"']),
-        ({"target": {"kind": "none"}, "renderer": {"cache": False}, "output": {"spp": 3}}, None, []),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("tables", "solver", "named"), [
+    ({"representation": {"hidden": 64, "depth": 2}}, None, ["depth, representation.hidden: no effect"]),
+    ({"representation": {"hidden": 64, "kind": "siren"}}, "adam", []),
+    ({"representation": {"kind": "siren", "cycles": 3}}, "adam", ['= "layers", got "siren"']),
+    ({"fit": {"lr": 1}}, None, ["fit.lr: no effect: needs representation.kind"]),
+    ({"fit": {"restart_period": 7}, "representation": {"kind": "siren"}}, "adam", ["needs fit.schedule"]),
+    ({"fit": {"awp_lr": 1, "awp_gamma": 0}, "representation": {"kind": "siren"}}, None, ["fit.awp_lr"]),
+    ({"optimizer": {"lr": 0.1, "schedule": "constant"}, "loss": {"ssim": 1}}, "adam", []),
+    (
+        {
+            "optimizer": {"lr": 0.1, "schedule": "constant"},
+            "loss": {"ssim": 1},
+            "renderer": {"refresh": 5},
+        },
+        "gauss-newton",
+        ["loss.ssim, optimizer.lr, optimizer.schedule, renderer.refresh: no effect with"],
+    ),
+    ({"loss": {"ssim": 0.1}, "optimizer": {"lr": "auto"}}, "gauss-newton", []),  # the defaults
+    ({"renderer": {"kind": "path", "memory_gb": 3}}, "adam", ['got "path"']),
+    ({"input": {"envmap": "a.exr", "azimuth": 3}}, None, ["azimuth: no effect: needs input.envmap"]),
+    ({"input": {"azimuth": 3}}, None, []),
+    ({"input": {"lights": LIGHTS, "horizon": "keep", "rows": "upper"}}, None, []),  # they use the horizon
+    ({"input": {"rows": "upper", "horizon": "keep"}}, None, ["horizon: no effect: needs input.rows"]),
+    ({"target": {"paint": 2}}, None, ["target.paint: no effect: needs target.kind"]),
+    ({"perceptual": {"vgg": "a", "dists": "b"}}, None, ["perceptual.dists, perceptual.vgg: no effect"]),
+    ({"target": {"kind": "none"}, "optimizer": {"iterations": 3}}, None, ['other than "none"']),
+    ({"target": {"kind": "none"}, "renderer": {"cache": False}, "output": {"spp": 3}}, None, []),
+])  # fmt: skip
 def test_keys_that_do_not_apply_are_named_with_the_reason(tables, solver, named):
     made = config.from_dict(tables, "/")
     said = config.unused(made, solver)

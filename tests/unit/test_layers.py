@@ -85,8 +85,6 @@ def random_gain(params, rng, size=1.0):
 
 
 # ---- identity --------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(("glow", "shape", "level"), [
     (True, SHAPE, 1.0), (False, SHAPE, 1.0), (True, (33, 66), 1e4), (True, (24, 48), 1e-3),
     (False, (24, 48), 1e4), (True, (16, 32), 1.0), (False, (17, 30), 1.0),
@@ -120,8 +118,6 @@ def test_map_is_its_parts(sunny):
 
 
 # ---- rows ------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(("first", "last"), [(0, 40), (10, 40), (12, 64)])
 def test_rows_of_a_map(first, last, sunny):
@@ -142,8 +138,6 @@ def test_rows_of_a_map(first, last, sunny):
 
 
 # ---- gain ------------------------------------------------------------------------------------------------
-
-
 def test_log_gain_is_that_of_the_map(rng):
     made, params = encoded(grey(1.0, 24, 48))
     params = random_gain(params, rng, 0.3)
@@ -180,8 +174,6 @@ def test_black_channel_is_brightened_by_the_veil(factor):
 
 
 # ---- texels that are kept --------------------------------------------------------------------------------
-
-
 def test_kept_texels_keep_their_bits_under_any_gain(rng, sunny):
     free = rng.random(SHAPE) < 0.4
     made, params = sunny
@@ -202,8 +194,6 @@ def test_light_moves_into_kept_texels(sunny):
 
 
 # ---- moving lights ---------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("end", [(40, 60), (25, 0), (10, 120), (50, 3)])
 def test_moving_a_light_without_a_glow_leaves_the_background(end):
     image = 0.5 + lamp()
@@ -242,8 +232,6 @@ def test_moving_a_light_with_a_glow_leaves_what_is_far_from_it(sunny):
 
 
 # ---- derivatives -----------------------------------------------------------------------------------------
-
-
 def gradients(made, params, weight):
     params = {name: mi.TensorXf(value) for name, value in params.items()}
     dr.enable_grad(params)
@@ -285,8 +273,6 @@ def test_kept_texels_pull_at_no_gain(rng, sunny):
 
 
 # ---- stress ----------------------------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("shape", [(3, 6), (4, 6), (5, 6), (6, 6)])
 def test_smallest_maps(shape, rng):

@@ -25,19 +25,16 @@ def weight(region):
     return map_regions.kept([{"softness": 0.0, **region, "action": "keep"}], *SHAPE)
 
 
-@pytest.mark.parametrize(
-    ("key", "region"),
-    [
-        ("action: got none", {}),
-        ("got neither of points and polygon", {"action": "keep"}),
-        ("radius: got none", {"action": "keep", "points": [[0, 0]]}),
-        ("radius: got 0", {"action": "keep", "points": [[0, 0]], "radius": 0}),
-        ("points: got .* elevation from -90", {"action": "keep", "points": [[0, 91]], "radius": 1}),
-        ("factor: got none", {"action": "scale", "polygon": WHOLE}),
-        ("factor: got .* expected none", {"action": "fill", "polygon": WHOLE, "factor": [1, 1, 1]}),
-        ("did you mean polygon", {"action": "keep", "poligon": WHOLE}),
-    ],
-)
+@pytest.mark.parametrize(("key", "region"), [
+    ("action: got none", {}),
+    ("got neither of points and polygon", {"action": "keep"}),
+    ("radius: got none", {"action": "keep", "points": [[0, 0]]}),
+    ("radius: got 0", {"action": "keep", "points": [[0, 0]], "radius": 0}),
+    ("points: got .* elevation from -90", {"action": "keep", "points": [[0, 91]], "radius": 1}),
+    ("factor: got none", {"action": "scale", "polygon": WHOLE}),
+    ("factor: got .* expected none", {"action": "fill", "polygon": WHOLE, "factor": [1, 1, 1]}),
+    ("did you mean polygon", {"action": "keep", "poligon": WHOLE}),
+])  # fmt: skip
 def test_an_unusable_region_is_named(key, region):
     with pytest.raises(ConfigError, match=rf"input.regions\[1\].*{key}"):
         config.from_dict({"input": {"regions": [{"action": "keep", "polygon": WHOLE}, region]}})
@@ -79,10 +76,9 @@ def test_scaling_fades_outside_the_border():
     assert np.allclose(changed[fading][:, 2], 65504 * (1 - inside[fading]), rtol=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("centre", "radius", "error"),
-    [((0.0, -90.0), 20.0, 0.6), ((0.0, 0.0), 15.0, 0.5), ((123.0, 88.0), 10.0, 0.2)],
-)
+@pytest.mark.parametrize(("centre", "radius", "error"), [
+    ((0.0, -90.0), 20.0, 0.6), ((0.0, 0.0), 15.0, 0.5), ((123.0, 88.0), 10.0, 0.2),
+])  # fmt: skip
 def test_a_filling_continues_its_surroundings(centre, radius, error):
     """What was there (1e4) leaves no trace; on a smooth map the hole is guessed to its own variation."""
     pytest.importorskip("cv2")

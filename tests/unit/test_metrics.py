@@ -124,9 +124,6 @@ def test_unsuitable_images_are_refused(name):
             function(a, b)
 
 
-# ---- painted pictures --------------------------------------------------------------------------------------
-
-
 def test_painted_tells_how_far_the_paint_was_followed_and_how_still_the_rest_was_held():
     initial = np.full((4, 6, 3), 0.25)
     coverage = np.zeros((4, 6, 1))

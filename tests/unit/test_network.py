@@ -55,9 +55,6 @@ def differ(a, b, tolerance=1e-4):
     return [name for name in b if not np.linalg.norm(a[name] - b[name]) < tolerance * np.linalg.norm(b[name])]
 
 
-# ---- forward ---------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(("hidden", "depth"), [(1, 0), (7, 0), (33, 2), (16, 6)])
 @pytest.mark.parametrize("count", POINTS)
 def test_forward_is_the_published_network(hidden, depth, count, rng):
@@ -78,9 +75,6 @@ def test_extreme_outputs_saturate_without_overflow():
     np.testing.assert_array_equal(y.numpy(), np.repeat([[0.0, 0.5, 1.0]], 8, axis=0))
     grads = siren.backward(params, tape, own(np.ones((8, 3))))
     assert all(np.isfinite(g.numpy()).all() for g in grads.values())
-
-
-# ---- gradient --------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("depth", range(8))
@@ -139,9 +133,6 @@ def test_gradient_flows_on_in_a_larger_graph(rng):
     got = np.sum(np.array(dr.grad(leaves["1.bias"]), np.float64) * np.array(params["1.bias"])) / 2
     assert got != 0
     np.testing.assert_allclose(dr.grad(gain)[0], got, rtol=1e-4)
-
-
-# ---- initial weights, coordinates ------------------------------------------------------------------------
 
 
 def test_initial_weights_are_uniform_within_the_published_bounds():

@@ -59,9 +59,6 @@ def again(params, times, x, wanted, light, share):
     return params
 
 
-# ---- what is solved --------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("share", [0.0, 1.0, 30.0])
 def test_the_solution_is_where_the_weighted_error_is_level(share, rng):
     params, x, wanted, light = problem(rng)
@@ -99,9 +96,6 @@ def test_a_last_layer_that_explains_everything_is_found(rng):
     solved = again(solved, 4, *given)
     for name in ("2.weight", "2.bias"):
         np.testing.assert_allclose(solved[name].numpy(), truth[name].numpy(), atol=1e-4)
-
-
-# ---- what is left alone ----------------------------------------------------------------------------------
 
 
 def test_all_but_the_last_layer_stays_and_the_order_of_the_parameters(rng):
@@ -147,9 +141,6 @@ def test_what_is_not_finite_changes_no_channel_that_it_meets(where, rng):
         np.testing.assert_array_equal(solved[name].numpy()[met], params[name].numpy()[met])
         if len(met) < 3:
             assert np.isfinite(np.delete(solved[name].numpy(), met, axis=0)).all()
-
-
-# ---- limits ----------------------------------------------------------------------------------------------
 
 
 def extremes(rng):

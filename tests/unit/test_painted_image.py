@@ -64,8 +64,6 @@ def refused(words, *arguments, **kwargs):
 
 
 # ---- what was painted --------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("kind", ["exr", "half", "hdr", "png16", "png8", "widened"])
 @pytest.mark.parametrize("name", TONEMAPS)
 def test_exactly_the_rectangle_is_painted(kind, name, initial, tmp_path):
@@ -213,17 +211,10 @@ def test_one_pixel(tmp_path):
 
 
 # ---- tonemaps ----------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("kind", "text"),
-    [
-        (b"tEXt", b"log"),
-        (b"zTXt", b"\0" + zlib.compress(b"log")),
-        (b"iTXt", b"\0\0de\0\0log"),
-        (b"iTXt", b"\1\0\0\0" + zlib.compress(b"log")),
-    ],
-)
+@pytest.mark.parametrize(("kind", "text"), [
+    (b"tEXt", b"log"), (b"zTXt", b"\0" + zlib.compress(b"log")), (b"iTXt", b"\0\0de\0\0log"),
+    (b"iTXt", b"\1\0\0\0" + zlib.compress(b"log")),
+])  # fmt: skip
 def test_the_tonemap_that_the_file_names_is_used(kind, text, initial, tmp_path):
     wanted, where = brushed(initial)
     file = png(tmp_path / "p.png", codes(wanted, "log", 65535))
@@ -318,8 +309,6 @@ def test_another_rendering_is_noticed(initial, rng, tmp_path):
 
 
 # ---- clipped -----------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("name", ["gamma", "srgb", "linear"])
 @pytest.mark.parametrize("top", [255, 65535])
 def test_clipped_pixels_are_excluded(top, name, initial, tmp_path):
@@ -345,8 +334,6 @@ def test_white_of_a_jpeg_is_not_quite_white(initial, tmp_path):
 
 
 # ---- alpha -------------------------------------------------------------------------------------------------
-
-
 def layer(initial):
     """Return display values (h, w, 4) of a layer with one stroke, half transparent in its first column."""
     pixels = np.zeros((*SIZE, 4))
@@ -412,8 +399,6 @@ def test_layers_of_an_exr_are_named(initial, tmp_path):
 
 
 # ---- grey, palettes, marks ---------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("kind", ["png", "png alpha", "jpg", "exr"])
 def test_grey(kind, initial, tmp_path):
     grey = np.repeat(initial[..., 1:2], 3, axis=2).clip(0.05, 0.8)
@@ -467,8 +452,6 @@ def test_cmyk_is_refused(initial, tmp_path):
 
 
 # ---- refused -----------------------------------------------------------------------------------------------
-
-
 def test_another_size(initial, tmp_path):
     file = png(tmp_path / "p.png", codes(initial)[:40])
     refused(["is 83x40 pixels", "83x60", "aspect", "--export-initial"], file, SIZE, "gamma", initial)
@@ -527,8 +510,6 @@ def test_negative_values_are_set_to_zero(initial, tmp_path):
 
 
 # ---- masks -------------------------------------------------------------------------------------------------
-
-
 def test_a_mask_overrides_what_is_seen(initial, tmp_path):
     wanted, where = brushed(initial)
     mask = np.zeros((*SIZE, 3), np.uint8)
@@ -563,23 +544,18 @@ def test_black_of_a_jpeg_mask_is_black(tmp_path):
     np.testing.assert_array_equal(weight[..., 0], mask[..., 0] > 100)
 
 
-@pytest.mark.parametrize(
-    ("values", "says"),
-    [
-        (np.zeros((4, 6, 3)), "black everywhere"),
-        (np.ones((4, 5, 3)), "is 5x4 pixels, the target is 6x4"),
-        (np.full((4, 6, 3), np.nan), "row 0, column 0"),
-        (np.full((4, 6, 3), -1.0), "black everywhere"),
-    ],
-)
+@pytest.mark.parametrize(("values", "says"), [
+    (np.zeros((4, 6, 3)), "black everywhere"),
+    (np.ones((4, 5, 3)), "is 5x4 pixels, the target is 6x4"),
+    (np.full((4, 6, 3), np.nan), "row 0, column 0"),
+    (np.full((4, 6, 3), -1.0), "black everywhere"),
+])  # fmt: skip
 def test_masks_that_cannot_be_used(values, says, tmp_path):
     with pytest.raises(InputError, match=rf"m\.exr.*{says}"):
         painted_image.read_mask(floats(tmp_path / "m.exr", values), (4, 6))
 
 
 # ---- the rendering to paint on -----------------------------------------------------------------------------
-
-
 def settings(**target):
     return config.Config(target=config.Target(**target), seed=3)
 

@@ -98,15 +98,12 @@ def test_what_is_known_of_a_photograph_survives_a_checkpoint(lit, tmp_path):
     np.testing.assert_array_equal(again.picture, later.picture)
 
 
-@pytest.mark.parametrize(
-    ("values", "keys", "error", "says"),
-    [
-        (np.full((12, 20, 3), 0.5), {}, InputError, "another aspect; crop"),
-        (np.zeros((12, 16, 3)), {}, InputError, "neither black nor clipped"),
-        (np.ones((12, 16, 3)), {}, InputError, "take another exposure"),
-        (np.full((12, 16, 3), 0.5), {"file": ("a.png", "b.png"), "view": ()}, ConfigError, "one file"),
-    ],
-)
+@pytest.mark.parametrize(("values", "keys", "error", "says"), [
+    (np.full((12, 20, 3), 0.5), {}, InputError, "another aspect; crop"),
+    (np.zeros((12, 16, 3)), {}, InputError, "neither black nor clipped"),
+    (np.ones((12, 16, 3)), {}, InputError, "take another exposure"),
+    (np.full((12, 16, 3), 0.5), {"file": ("a.png", "b.png"), "view": ()}, ConfigError, "one file"),
+])  # fmt: skip
 def test_photographs_that_tell_nothing_are_refused(lit, tmp_path, values, keys, error, says):
     images.write_png(tmp_path / "photo.png", values)
     with pytest.raises(error, match=says):

@@ -71,18 +71,11 @@ def test_no_idiom_of_our_own_is_in_the_pages():
     assert not [line for file in PAGES for line in finds(file)]
 
 
-@pytest.mark.parametrize(
-    "line",
-    [
-        '"every so-manieth row"',
-        "# a light is born: the picture wants one",
-        "# detail that the picture tells",
-        'f"{name}: came {value}, wanted a number"',
-        '"they count less"',
-        '"asking what any light could do"',
-        "# speckle comes and goes, and is not chased",
-    ],
-)
+@pytest.mark.parametrize("line", [
+    '"every so-manieth row"', "# a light is born: the picture wants one", "# detail that the picture tells",
+    'f"{name}: came {value}, wanted a number"', '"they count less"', '"asking what any light could do"',
+    "# speckle comes and goes, and is not chased",
+])  # fmt: skip
 def test_the_examples_are_found(line, tmp_path, monkeypatch):
     monkeypatch.setitem(globals(), "ROOT", tmp_path)
     file = tmp_path / "a.py"

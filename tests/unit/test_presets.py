@@ -8,8 +8,6 @@ from envedit import config as cfg
 from envedit.config import presets
 from envedit.core.errors import ConfigError
 
-# ---- presets -----------------------------------------------------------------------------------------------
-
 
 def test_the_paper_preset_is_section_6():
     paper = cfg.loads("", preset="paper")
@@ -35,9 +33,6 @@ def test_the_paper_preset_spells_out_every_number_of_the_method():
         assert set(presets.PRESETS["paper"][table]) == keys - left_out, table
 
 
-# ---- precedence --------------------------------------------------------------------------------------------
-
-
 def test_default_then_preset_then_file_then_override():
     assert cfg.loads("").fit.epochs == 1200
     assert cfg.loads('preset = "draft"').fit.epochs == 500
@@ -56,21 +51,16 @@ def test_scene_parameters_are_merged_key_by_key():
     assert config.scene.parameters == {"a": "glossy", "b": True}
 
 
-# ---- defaults of a kind of representation ----------------------------------------------------------------
-
 MANY = ("siren", "pixels", "log-pixels")
 
 
-@pytest.mark.parametrize(
-    ("preset", "kind", "ssim", "iterations"),
-    [
-        ("standard", "layers", 0.1, 100),
-        ("draft", "layers", 0.1, 100),
-        *(("standard", kind, 1.0, "auto" if kind == "siren" else 600) for kind in MANY),
-        *(("draft", kind, 1.0, 150) for kind in MANY),
-        *(("paper", kind, (1.0, 1e4), 400) for kind in ("layers", *MANY)),
-    ],
-)
+@pytest.mark.parametrize(("preset", "kind", "ssim", "iterations"), [
+    ("standard", "layers", 0.1, 100),
+    ("draft", "layers", 0.1, 100),
+    *(("standard", kind, 1.0, "auto" if kind == "siren" else 600) for kind in MANY),
+    *(("draft", kind, 1.0, 150) for kind in MANY),
+    *(("paper", kind, (1.0, 1e4), 400) for kind in ("layers", *MANY)),
+])  # fmt: skip
 def test_loss_and_length_suit_the_kind(preset, kind, ssim, iterations):
     given = [
         cfg.loads(f'preset = "{preset}"\n[representation]\nkind = "{kind}"'),
@@ -108,9 +98,6 @@ def test_dists_is_left_to_the_weights_for_a_siren_alone():
     assert (paper.loss.dists, paper.optimizer.iterations) == (0.6, 400)
 
 
-# ---- targets -----------------------------------------------------------------------------------------------
-
-
 def test_a_target_is_a_file_or_a_turn_and_the_last_one_given_counts():
     for config in (cfg.loads(""), cfg.loads("[target]\nfile = 'b.exr'")):
         assert config.target.rotate_degrees == "auto"
@@ -136,9 +123,6 @@ def test_a_target_is_a_file_or_a_turn_and_the_last_one_given_counts():
         text = f"[target]\nkind = '{kind}'\nfile = 'b.exr'"
         cleared = cfg.loads(text, overrides=["target.kind=envmap", "target.file="]).target
         assert cleared.file == "" and cleared.rotate_degrees == "auto"
-
-
-# ---- files and paths ---------------------------------------------------------------------------------------
 
 
 def test_paths_are_relative_to_the_file_and_names_that_are_no_paths_stay(tmp_path, here):

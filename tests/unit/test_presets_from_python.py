@@ -36,9 +36,6 @@ def test_what_is_given_and_equal_to_the_default_goes_before_the_preset_too():
     assert Config(preset="draft", scene=Scene("sphere", 128)).scene.width == 128
 
 
-# ---- replace -----------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(("before", "after"), [*itertools.permutations(PRESETS, 2)])
 def test_replacing_the_preset_is_making_it_with_the_other_one(before, after):
     tables = {"scene": Scene(parameters={"roughness": 0.3}), "optimizer": Optimizer(lr=0.5), "seed": 3}

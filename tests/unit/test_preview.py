@@ -71,9 +71,6 @@ def test_preview_names_its_columns_whatever_their_text(tmp_path):
     assert "x" * 500 in described(tmp_path / "p.png")
 
 
-# ---- differences -------------------------------------------------------------------------------------------
-
-
 def test_difference_is_red_where_brighter_blue_where_darker_white_where_equal():
     b = grey(0.5, 3, 4)
     a = b.copy()

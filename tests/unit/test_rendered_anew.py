@@ -86,9 +86,6 @@ def test_black_renderings_say_nothing(sphere):
     assert not rendered_anew.is_rendered_anew(black + 1, black, np.ones((*FILM, 1)), lambda: black)
 
 
-# ---- noise -------------------------------------------------------------------------------------------------
-
-
 def noisy(rng, sigma, shape=(64, 96), views=1):
     """Return linear radiance whose display values are a gradient with white noise."""
     high, wide = shape

@@ -41,16 +41,13 @@ def test_references_in_a_circle_are_refused(tmp_path):
     refused(write_scene(tmp_path, SENSOR, LIGHT, *parts), "refer to one another in a circle")
 
 
-@pytest.mark.parametrize(
-    "part, says",
-    [
-        ('<bsdf type="blendbsdf"/>', "blendbsdf has no weight"),
-        ('<bsdf type="BlendBSDF" id="b"><bsdf type="diffuse"/></bsdf>', "blendbsdf has no weight"),
-        ('<bsdf type="normalmap"><bsdf type="diffuse"/></bsdf>', "normalmap has no normalmap"),
-        ('<emitter type="spot"><texture name="texture" type="bitmap"/></emitter>', "bitmap has no filename"),
-        ('<texture type="bitmap"><float name="filename" value="2"/></texture>', "filename is 2"),
-    ],
-)
+@pytest.mark.parametrize("part, says", [
+    ('<bsdf type="blendbsdf"/>', "blendbsdf has no weight"),
+    ('<bsdf type="BlendBSDF" id="b"><bsdf type="diffuse"/></bsdf>', "blendbsdf has no weight"),
+    ('<bsdf type="normalmap"><bsdf type="diffuse"/></bsdf>', "normalmap has no normalmap"),
+    ('<emitter type="spot"><texture name="texture" type="bitmap"/></emitter>', "bitmap has no filename"),
+    ('<texture type="bitmap"><float name="filename" value="2"/></texture>', "filename is 2"),
+])  # fmt: skip
 def test_what_mitsuba_reads_without_looking_must_be_there(tmp_path, part, says):
     refused(write_scene(tmp_path, SENSOR, LIGHT, part), says)
 

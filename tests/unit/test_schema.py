@@ -19,9 +19,8 @@ quick = settings(deadline=None, max_examples=150, suppress_health_check=[HealthC
 
 KINDS = ("layers", "siren", "pixels", "log-pixels")
 
+
 # ---- defaults ----------------------------------------------------------------------------------------------
-
-
 def test_an_empty_file_gives_the_defaults():
     config = cfg.loads("")
     assert config.preset == "standard" and config == dataclasses.replace(cfg.Config(), output=config.output)
@@ -41,24 +40,19 @@ def test_gauss_newton_without_layers_or_a_transport_is_refused(tables):
 
 
 # ---- overrides ---------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    "text, keys, value",
-    [
-        ("fit.epochs=10", ("fit", "epochs"), 10),
-        ("seed = 3", ("seed",), 3),
-        ("input.envmap=maps/a b.exr", ("input", "envmap"), "maps/a b.exr"),
-        ('input.envmap="a=b"', ("input", "envmap"), "a=b"),
-        ("loss.ssim=[1, 1e4]", ("loss", "ssim"), [1, 1e4]),
-        ("renderer.spp=auto", ("renderer", "spp"), "auto"),
-        ("output.report=false", ("output", "report"), False),
-        ("output.dir=", ("output", "dir"), ""),
-        ("scene.parameters.roughness=0.5", ("scene", "parameters", "roughness"), 0.5),
-        ("fit.epochs=1\nseed=2", ("fit", "epochs"), "1\nseed=2"),
-        ("seed=0x", ("seed",), "0x"),
-    ],
-)
+@pytest.mark.parametrize("text, keys, value", [
+    ("fit.epochs=10", ("fit", "epochs"), 10),
+    ("seed = 3", ("seed",), 3),
+    ("input.envmap=maps/a b.exr", ("input", "envmap"), "maps/a b.exr"),
+    ('input.envmap="a=b"', ("input", "envmap"), "a=b"),
+    ("loss.ssim=[1, 1e4]", ("loss", "ssim"), [1, 1e4]),
+    ("renderer.spp=auto", ("renderer", "spp"), "auto"),
+    ("output.report=false", ("output", "report"), False),
+    ("output.dir=", ("output", "dir"), ""),
+    ("scene.parameters.roughness=0.5", ("scene", "parameters", "roughness"), 0.5),
+    ("fit.epochs=1\nseed=2", ("fit", "epochs"), "1\nseed=2"),
+    ("seed=0x", ("seed",), "0x"),
+])  # fmt: skip
 def test_overrides_are_toml_or_bare_words(text, keys, value):
     assert cfg.parse_override(text) == (keys, value)
 
@@ -70,46 +64,41 @@ def test_an_override_without_key_or_value_is_refused(text):
 
 
 # ---- refusals ----------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    "text, parts",
-    [
-        ("[fit]\nepoch = 3", ["a.toml", "[fit] has no key epoch", "did you mean epochs?"]),
-        ("epochs = 3", ["unknown table or key epochs", "did you mean fit.epochs?"]),
-        ("[ouput]\ndir = 'x'", ["unknown table or key ouput", "did you mean output?"]),
-        ("[loss]\nrestart_period = 3", ["[loss] has no key", "did you mean fit.restart_period?"]),
-        ("[fit]\nxyzzy = 3", ["[fit] has no key xyzzy", "known: epochs, lr"]),
-        ("fit = 3", ["fit: got 3, expected a table"]),
-        ("[seed]\na = 1", ["seed: got {'a': 1}, expected an integer"]),
-        ('preset = "drift"', ["preset: got 'drift'", "did you mean draft?"]),
-        ('[representation]\nkind = "layer"', ["representation.kind: got 'layer'", "did you mean layers?"]),
-        ("[representation]\ncycles = 0", ["representation.cycles: got 0", "from 1 to 256"]),
-        ('[fit]\nschedule = "cosin"', ["fit.schedule: got 'cosin'", "did you mean cosine?"]),
-        ("[target]\nfile = 'b.exr'\nrotate_degrees = 5", ["a.toml", "target.file and target.rotate_degrees"]),
-        ("[target]\nkind = 'image'", ["target.file", "expected the painted image"]),
-        (
-            "[target]\nkind = 'rendering'\nfile = ['a.png', 'b.png']\nmask = 'm.png'",
-            ["target.mask: got 1 masks, expected 2"],
-        ),
-        ("[target]\nrest = 'stay'", ["target.rest: got 'stay'", "follow"]),
-        ("[solve]\nfreedom = 1.5", ["solve.freedom: got 1.5"]),
-        ("[solve]\nfreedom = -0.1", ["solve.freedom: got -0.1"]),
-        (
-            "[target]\nkind = 'strokes'\nmask = 'm.png'\n[[target.strokes]]\ntype = 'contrast'",
-            ["target.mask: got '", "m.png', expected none"],
-        ),
-        ("[target]\nkind = 'imgae'", ["target.kind: got 'imgae'", "did you mean image?"]),
-        ("[input]\nwidth = 128\nrows = [0, 64]", ["input.rows: got [0, 64], expected rows below 64"]),
-        ("[loss]\nssim = 0\nimage_l1 = 0\nimage_l2 = 0", ["loss.ssim, loss.image_l1, loss.image_l2: got 0"]),
-        ("[fit]\nlog_mse = 0\nlog_ssim = 0\nhdr = 0", ["got 0 for all"]),
-        ("a = ", ["not TOML", "at line 1, column 5", "end of document"]),
-        ("[fit]\nepochs = = 3", ["a.toml: not TOML", "at line 2, column 10"]),
-        ("x = " + "[" * 5000, ["not TOML", "nested too deeply"]),
-        ("seed = " + "9" * 5000, ["not TOML"]),
-        ("seed = 0x" + "f" * 5000, ["seed: got a huge int"]),
-    ],
-)
+@pytest.mark.parametrize("text, parts", [
+    ("[fit]\nepoch = 3", ["a.toml", "[fit] has no key epoch", "did you mean epochs?"]),
+    ("epochs = 3", ["unknown table or key epochs", "did you mean fit.epochs?"]),
+    ("[ouput]\ndir = 'x'", ["unknown table or key ouput", "did you mean output?"]),
+    ("[loss]\nrestart_period = 3", ["[loss] has no key", "did you mean fit.restart_period?"]),
+    ("[fit]\nxyzzy = 3", ["[fit] has no key xyzzy", "known: epochs, lr"]),
+    ("fit = 3", ["fit: got 3, expected a table"]),
+    ("[seed]\na = 1", ["seed: got {'a': 1}, expected an integer"]),
+    ('preset = "drift"', ["preset: got 'drift'", "did you mean draft?"]),
+    ('[representation]\nkind = "layer"', ["representation.kind: got 'layer'", "did you mean layers?"]),
+    ("[representation]\ncycles = 0", ["representation.cycles: got 0", "from 1 to 256"]),
+    ('[fit]\nschedule = "cosin"', ["fit.schedule: got 'cosin'", "did you mean cosine?"]),
+    ("[target]\nfile = 'b.exr'\nrotate_degrees = 5", ["a.toml", "target.file and target.rotate_degrees"]),
+    ("[target]\nkind = 'image'", ["target.file", "expected the painted image"]),
+    (
+        "[target]\nkind = 'rendering'\nfile = ['a.png', 'b.png']\nmask = 'm.png'",
+        ["target.mask: got 1 masks, expected 2"],
+    ),
+    ("[target]\nrest = 'stay'", ["target.rest: got 'stay'", "follow"]),
+    ("[solve]\nfreedom = 1.5", ["solve.freedom: got 1.5"]),
+    ("[solve]\nfreedom = -0.1", ["solve.freedom: got -0.1"]),
+    (
+        "[target]\nkind = 'strokes'\nmask = 'm.png'\n[[target.strokes]]\ntype = 'contrast'",
+        ["target.mask: got '", "m.png', expected none"],
+    ),
+    ("[target]\nkind = 'imgae'", ["target.kind: got 'imgae'", "did you mean image?"]),
+    ("[input]\nwidth = 128\nrows = [0, 64]", ["input.rows: got [0, 64], expected rows below 64"]),
+    ("[loss]\nssim = 0\nimage_l1 = 0\nimage_l2 = 0", ["loss.ssim, loss.image_l1, loss.image_l2: got 0"]),
+    ("[fit]\nlog_mse = 0\nlog_ssim = 0\nhdr = 0", ["got 0 for all"]),
+    ("a = ", ["not TOML", "at line 1, column 5", "end of document"]),
+    ("[fit]\nepochs = = 3", ["a.toml: not TOML", "at line 2, column 10"]),
+    ("x = " + "[" * 5000, ["not TOML", "nested too deeply"]),
+    ("seed = " + "9" * 5000, ["not TOML"]),
+    ("seed = 0x" + "f" * 5000, ["seed: got a huge int"]),
+])  # fmt: skip
 def test_a_refusal_says_where_what_and_what_to_do(text, parts):
     message = refused(text)
     for part in parts:

@@ -64,8 +64,6 @@ def checked(m, rows=None):
 
 
 # ---- one light and several ---------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("where", SUNS)
 def test_a_sun_of_one_texel_is_one_light(where):
     row, column = SUNS[where]
@@ -130,8 +128,6 @@ def test_one_bright_texel_in_the_dark_is_all_there_is(exposure):
 
 
 # ---- no light ----------------------------------------------------------------------------------------------
-
-
 def noise():
     return np.random.default_rng(0).uniform(1, 2, (HEIGHT, WIDTH, 3))
 
@@ -141,11 +137,9 @@ def ramp():
     return np.exp(1.5 * latlong.directions(HEIGHT, WIDTH)[..., [2]]) * [0.3, 0.4, 0.6]
 
 
-@pytest.mark.parametrize(
-    "m",
-    [np.full((HEIGHT, WIDTH, 3), 0.7), np.zeros((HEIGHT, WIDTH, 3)), sky(), ramp(), noise()],
-    ids=["constant", "black", "sky", "gradient", "noise"],
-)
+@pytest.mark.parametrize("m", [
+    np.full((HEIGHT, WIDTH, 3), 0.7), np.zeros((HEIGHT, WIDTH, 3)), sky(), ramp(), noise(),
+], ids=["constant", "black", "sky", "gradient", "noise"])  # fmt: skip
 def test_where_nothing_stands_out_the_background_is_the_map(m):
     s = checked(m)
     assert s.lights == [] and s.background.tobytes() == m.tobytes()
@@ -162,8 +156,6 @@ def test_a_lamp_without_flux_is_no_light():
 
 
 # ---- any map -----------------------------------------------------------------------------------------------
-
-
 @settings(max_examples=30, deadline=None)
 @given(
     st.integers(3, 14),
@@ -193,8 +185,6 @@ def test_extreme_values_stay_finite(value):
 
 
 # ---- crops, sizes, exposures -------------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("rows", [(0, 32), (10, 40), (19, 21)])
 @pytest.mark.parametrize("scale", [1, 5])
@@ -242,8 +232,6 @@ def test_lights_do_not_depend_on_the_resolution():
 
 
 # ---- glow --------------------------------------------------------------------------------------------------
-
-
 def glowing(elevation, azimuth, strength, decay, unrest, horizon=0.0):
     """Return a sun in a glow, the sky without both, and the glow's factor at every texel.
 
@@ -260,17 +248,10 @@ def glowing(elevation, azimuth, strength, decay, unrest, horizon=0.0):
     return m, base, glow, away
 
 
-@pytest.mark.parametrize(
-    "elevation, azimuth, strength, decay, unrest, horizon",
-    [
-        (45, 100, 5, 8, 0, 0),
-        (30, 0, 10, 15, 0.1, 0),
-        (3, 10, 20, 10, 0, 0),
-        (80, 200, 5, 8, 0.1, 0),
-        (20, 100, 8, 12, 0, 1.5),
-        (10, 200, 8, 12, 0.1, 1.0),
-    ],
-)
+@pytest.mark.parametrize("elevation, azimuth, strength, decay, unrest, horizon", [
+    (45, 100, 5, 8, 0, 0), (30, 0, 10, 15, 0.1, 0), (3, 10, 20, 10, 0, 0), (80, 200, 5, 8, 0.1, 0),
+    (20, 100, 8, 12, 0, 1.5), (10, 200, 8, 12, 0.1, 1.0),
+])  # fmt: skip
 def test_a_glow_is_found_and_taken_from_the_sky(elevation, azimuth, strength, decay, unrest, horizon):
     m, base, glow, away = glowing(elevation, azimuth, strength, decay, unrest, horizon)
     s = checked(m)
@@ -305,8 +286,6 @@ def test_a_glow_is_interpolated_and_ends():
 
 
 # ---- filled ------------------------------------------------------------------------------------------------
-
-
 def hole(height, width, column, radius):
     r, c = np.mgrid[:height, :width]
     return np.hypot(r - height // 2, (c - column + width // 2) % width - width // 2) <= radius
@@ -349,8 +328,6 @@ def test_nothing_known_is_black_and_nothing_missing_is_the_map():
 
 
 # ---- survey ------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("rows", [None, (8, 64)])
 def test_a_survey_tells_where_the_lights_are(rows):
     m = discs((toward(40, 0.2), 3, 3e4), (toward(10, 120), 9, 300))

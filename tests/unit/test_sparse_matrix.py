@@ -125,9 +125,6 @@ def test_product_has_the_same_bits_every_time(rng):
         np.testing.assert_array_equal(product(ColourMatrix(rows, columns, weights, (300, 40)), x), first)
 
 
-# ---- coordinates -------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     "shape, count", [((37, 101), 200), ((9, 4), 0), ((1, 5), 3), ((64, 1), 20), ((300, 7), 900), ((16, 9), 1)]
 )
@@ -151,9 +148,6 @@ def test_coordinates_leave_out_what_is_zero(rng):
     r, c, w = ColourMatrix(rows, columns, weights, (20, 30)).coordinates()
     assert len(r) == weights.any(axis=1).sum() < len(rows)
     np.testing.assert_array_equal(dense(r, c, w, (20, 30)), dense(rows, columns, weights, (20, 30)))
-
-
-# ---- merge -------------------------------------------------------------------------------------------------
 
 
 def test_merge_adds_entries_of_one_place_and_sorts_them(rng):

@@ -129,8 +129,6 @@ def test_coverage_is_the_union_of_the_strokes():
 
 
 # ---- what --------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("name", TONEMAPS)
 @pytest.mark.parametrize("stroke", ALL, ids=[s["type"] for s in ALL])
 def test_what_no_stroke_covers_is_the_same_bit_for_bit(stroke, name, rng):
@@ -290,8 +288,6 @@ def test_display_values_go_on_above_white_and_come_back(name):
 
 
 # ---- extremes ----------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("name", TONEMAPS)
 @pytest.mark.parametrize("value", [0, 1e-38, 1e6, 3.4e38])
 @pytest.mark.parametrize("size", [(40, 40), (1, 1), (1, 30), (30, 2)])
@@ -347,47 +343,38 @@ def test_strokes_that_paint_nothing_say_so():
 DOT = "points = [[0.5, 0.5]], width = 0.1"
 
 
-@pytest.mark.parametrize(
-    "stroke, says",
-    [
-        ("amount = 1", "target.strokes[1].type: got none, expected one of shadow, light, erase-shadow"),
-        ("type = 'shade'", "did you mean shadow?"),
-        (f"type = 'shadow', {DOT}, widht = 1", "type shadow, has no key 'widht'; did you mean width?"),
-        ("type = 'shadow'", "target.strokes[1]: got no shape, expected one of points, polygon"),
-        (f"type = 'light', {DOT}, ellipse = [0, 0, 1, 1]", "got points and ellipse, expected one shape"),
-        ("type = 'light', points = [[0, 0]]", "target.strokes[1].width: got none, expected the width"),
-        (
-            "type = 'light', points = [[0, 0]], width = 0",
-            "target.strokes[1].width: got 0, expected a number above",
-        ),
-        (
-            "type = 'blur', radius = 1, width = 1",
-            "target.strokes[1].width: got 1, expected none without points",
-        ),
-        ("type = 'light', width = 1, points = []", "target.strokes[1].points: got [], expected [[x, y]"),
-        ("type = 'light', width = 1, points = [[0, 0], [1]]", "target.strokes[1].points[1]: got [1]"),
-        ("type = 'light', polygon = [[0, 0], [1, 1]]", "at least 3"),
-        ("type = 'light', ellipse = [0, 0, 1]", "ellipse: got [0, 0, 1], expected [cx, cy, rx, ry] or"),
-        ("type = 'light', ellipse = [0, 0, 1, 0]", "ellipse: got [0, 0, 1, 0], expected a number above 0"),
-        (
-            "type = 'light', rectangle = [1, 0, 0, 1]",
-            "rectangle: got [1, 0, 0, 1], expected [x0, y0, x1, y1] with",
-        ),
-        (f"type = 'light', {DOT}, color = [1, -1, 1]", "target.strokes[1].color: got [1, -1, 1], expected"),
-        (f"type = 'light', {DOT}, color = '#ffd9a'", "[r, g, b], or a colour such as"),
-        (
-            f"type = 'light', {DOT}, amount = -1",
-            "target.strokes[1].amount: got -1, expected a number of at least 0",
-        ),
-        (f"type = 'shadow', {DOT}, opacity = 2", "target.strokes[1].opacity: got 2, expected"),
-        (
-            f"type = 'shadow', {DOT}, units = 'pixel'",
-            "units: got 'pixel', expected one of fraction, pixels; did",
-        ),
-        ("type = 'temperature'", "target.strokes[1].kelvin: got none, expected a number"),
-        ("type = 'blur', radius = 0", "target.strokes[1].radius: got 0, expected a number above 0"),
-    ],
-)
+@pytest.mark.parametrize("stroke, says", [
+    ("amount = 1", "target.strokes[1].type: got none, expected one of shadow, light, erase-shadow"),
+    ("type = 'shade'", "did you mean shadow?"),
+    (f"type = 'shadow', {DOT}, widht = 1", "type shadow, has no key 'widht'; did you mean width?"),
+    ("type = 'shadow'", "target.strokes[1]: got no shape, expected one of points, polygon"),
+    (f"type = 'light', {DOT}, ellipse = [0, 0, 1, 1]", "got points and ellipse, expected one shape"),
+    ("type = 'light', points = [[0, 0]]", "target.strokes[1].width: got none, expected the width"),
+    (
+        "type = 'light', points = [[0, 0]], width = 0",
+        "target.strokes[1].width: got 0, expected a number above",
+    ),
+    ("type = 'blur', radius = 1, width = 1", "target.strokes[1].width: got 1, expected none without points"),
+    ("type = 'light', width = 1, points = []", "target.strokes[1].points: got [], expected [[x, y]"),
+    ("type = 'light', width = 1, points = [[0, 0], [1]]", "target.strokes[1].points[1]: got [1]"),
+    ("type = 'light', polygon = [[0, 0], [1, 1]]", "at least 3"),
+    ("type = 'light', ellipse = [0, 0, 1]", "ellipse: got [0, 0, 1], expected [cx, cy, rx, ry] or"),
+    ("type = 'light', ellipse = [0, 0, 1, 0]", "ellipse: got [0, 0, 1, 0], expected a number above 0"),
+    (
+        "type = 'light', rectangle = [1, 0, 0, 1]",
+        "rectangle: got [1, 0, 0, 1], expected [x0, y0, x1, y1] with",
+    ),
+    (f"type = 'light', {DOT}, color = [1, -1, 1]", "target.strokes[1].color: got [1, -1, 1], expected"),
+    (f"type = 'light', {DOT}, color = '#ffd9a'", "[r, g, b], or a colour such as"),
+    (
+        f"type = 'light', {DOT}, amount = -1",
+        "target.strokes[1].amount: got -1, expected a number of at least 0",
+    ),
+    (f"type = 'shadow', {DOT}, opacity = 2", "target.strokes[1].opacity: got 2, expected"),
+    (f"type = 'shadow', {DOT}, units = 'pixel'", "units: got 'pixel', expected one of fraction, pixels; did"),
+    ("type = 'temperature'", "target.strokes[1].kelvin: got none, expected a number"),
+    ("type = 'blur', radius = 0", "target.strokes[1].radius: got 0, expected a number above 0"),
+])  # fmt: skip
 def test_a_stroke_that_cannot_be_understood_is_refused_by_name(stroke, says):
     both = f"[{{type = 'contrast', amount = 1.2}}, {{{stroke}}}]"
     message = refused(f"[target]\nkind = 'strokes'\nstrokes = {both}")
@@ -422,8 +409,6 @@ def test_what_is_held_still_counts_as_painted_and_keeps_its_bits(rng):
 
 
 # ---- the edits that come ready -----------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("name", sorted(file.stem for file in EDITS.iterdir()))
 def test_the_edits_that_come_ready_paint_something(name, rng):
     config = cfg.load(EDITS / f"{name}.toml")

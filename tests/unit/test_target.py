@@ -29,8 +29,6 @@ def asking(seed=0, repair=False, **kwargs):
 
 
 # ---- rendered under a known map --------------------------------------------------------------------------
-
-
 def test_turned_target_is_the_rendering_of_the_turned_map(ball, rng):
     envmap = sky(rng)
     made = target.make(asking(5, rotate_degrees=40), ball, envmap)
@@ -93,8 +91,6 @@ def test_mask_counts_for_a_rendered_target_too(ball, tmp_path, rng):
 
 
 # ---- painted ---------------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def seen(ball):
     envmap = sky(np.random.default_rng(3))
@@ -159,24 +155,19 @@ def test_mask_of_an_array_overrides_what_is_seen(ball, seen):
     np.testing.assert_allclose(made.picture[:2], 2 * initial[:2], rtol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("picture", "mask", "says"),
-    [
-        (np.ones((3, 4, 3)), None, "shape"),
-        (np.full((*SIZE, 3), np.nan), None, "not finite"),
-        (np.ones((*SIZE, 3)), np.ones((4, 4)), "mask"),
-        (np.ones((*SIZE, 3)), np.full(SIZE, np.inf), "mask.*not finite"),
-        (np.ones((*SIZE, 3)), np.zeros(SIZE), "nothing"),
-    ],
-)
+@pytest.mark.parametrize(("picture", "mask", "says"), [
+    (np.ones((3, 4, 3)), None, "shape"),
+    (np.full((*SIZE, 3), np.nan), None, "not finite"),
+    (np.ones((*SIZE, 3)), np.ones((4, 4)), "mask"),
+    (np.ones((*SIZE, 3)), np.full(SIZE, np.inf), "mask.*not finite"),
+    (np.ones((*SIZE, 3)), np.zeros(SIZE), "nothing"),
+])  # fmt: skip
 def test_arrays_that_cannot_be_used(ball, seen, picture, mask, says):
     with pytest.raises(InputError, match=says):
         target.make(asking(), ball, seen[0], picture, mask)
 
 
 # ---- a picture of the scene under other light -----------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def pictured(ball):
     """A map, and the scene's picture under another one, within what a display shows."""
@@ -276,8 +267,6 @@ def test_every_view_of_a_picture_of_the_scene_may_have_its_file(ball, pictured, 
 
 
 # ---- weights ---------------------------------------------------------------------------------------------
-
-
 def test_paint_and_rest_have_their_weights_whatever_their_size():
     coverage = np.zeros((10, 10, 1))
     coverage[0, :2] = 1
@@ -300,8 +289,6 @@ def test_what_tells_nothing_has_no_weight_and_a_target_without_any_is_refused():
 
 
 # ---- pixels that see no surface ---------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 def test_paint_beside_the_object_does_not_count(tmp_path, rng):
     """Of a scene that hides what lights it: weights are shared out among pixels that see a surface."""

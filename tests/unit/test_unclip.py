@@ -130,14 +130,11 @@ def test_the_ratio_to_the_sky_and_the_flux_are_as_asked(tmp_path, capsys):
     capsys.readouterr()
 
 
-@pytest.mark.parametrize(
-    ("options", "text"),
-    [
-        (["--flux", "1", "2"], "--flux: got 2 numbers, expected 1 or 3"),
-        (["--flux", "-1"], "--flux: got"),
-        (["--ratio", "0"], "--ratio: got 0.0, expected a positive number"),
-    ],
-)
+@pytest.mark.parametrize(("options", "text"), [
+    (["--flux", "1", "2"], "--flux: got 2 numbers, expected 1 or 3"),
+    (["--flux", "-1"], "--flux: got"),
+    (["--ratio", "0"], "--ratio: got 0.0, expected a positive number"),
+])  # fmt: skip
 def test_wrong_options_are_one_line(options, text, tmp_path, capsys):
     assert of_file(tmp_path, overcast(), *options) == 2
     assert text in json.loads(capsys.readouterr().out)["error"]

@@ -193,8 +193,6 @@ def test_hostile_archives_are_refused(tmp_path):
 
 
 # ---- pickled checkpoints -----------------------------------------------------------------------------------
-
-
 @dataclasses.dataclass
 class Global:
     """What a pickle names, without a need for it."""
@@ -275,25 +273,22 @@ def test_arrays_of_numpy_and_tensors_of_pytorch_are_read_from_a_pickle(rng):
 SIX = Storage("1", np.zeros(6, np.float32))
 
 
-@pytest.mark.parametrize(
-    "data",
-    [
-        numpy_file({"a": Trap()}),
-        numpy_file({"a": np.array([Trap()], object)}),
-        torch_file({"a": Trap()}),
-        torch_file({"a": Global("os", "system")}),
-        torch_file({"a": Global("numpy", "load")}),
-        b"\x80\x03cnumpy\nndarray\n(I1\ntR.",
-        b"",
-        numpy_file({"a": np.zeros(3)}),
-        numpy_file({"a": 3}),
-        numpy_file([np.zeros(3, np.float32)]),
-        torch_file({"a": Tensor(SIX, 0, (2, 3), (1, 2))}, SIX),
-        torch_file({"a": Tensor(SIX, 4, (2, 3), (3, 1))}, SIX),
-        torch_file({"a": Tensor(SIX, 0, (6,), (1,))}, Storage("1", np.zeros(5, np.float32))),
-        torch_file({"a": Tensor(Storage("1", SIX.values, 2**40), 0, (6,), (1,))}),
-    ],
-)
+@pytest.mark.parametrize("data", [
+    numpy_file({"a": Trap()}),
+    numpy_file({"a": np.array([Trap()], object)}),
+    torch_file({"a": Trap()}),
+    torch_file({"a": Global("os", "system")}),
+    torch_file({"a": Global("numpy", "load")}),
+    b"\x80\x03cnumpy\nndarray\n(I1\ntR.",
+    b"",
+    numpy_file({"a": np.zeros(3)}),
+    numpy_file({"a": 3}),
+    numpy_file([np.zeros(3, np.float32)]),
+    torch_file({"a": Tensor(SIX, 0, (2, 3), (1, 2))}, SIX),
+    torch_file({"a": Tensor(SIX, 4, (2, 3), (3, 1))}, SIX),
+    torch_file({"a": Tensor(SIX, 0, (6,), (1,))}, Storage("1", np.zeros(5, np.float32))),
+    torch_file({"a": Tensor(Storage("1", SIX.values, 2**40), 0, (6,), (1,))}),
+])  # fmt: skip
 def test_a_checkpoint_of_anything_but_float32_is_refused_and_runs_no_code(data):
     with pytest.raises(InputError, match="x: no checkpoint of float32 arrays") as info:
         checkpoints.read(data, "x")
@@ -311,8 +306,6 @@ def test_every_truncation_of_a_checkpoint_is_refused(rng):
 
 
 # ---- the command that fetches them, and where runs look ----------------------------------------------------
-
-
 def small_network():
     conv = backbones.Conv
     return [conv(("features.0",), 3, 4, 3), backbones.Pool(2), conv(("features.3",), 4, 5, 1)]
@@ -375,14 +368,11 @@ def test_a_distribution_of_another_network_is_refused(tmp_path, distributions, c
     assert "another network" in said[-1] and not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(
-    ("stderr", "words"),
-    [
-        ("x\nERROR: THESE DO NOT MATCH THE HASHES\nmore", ("DO NOT MATCH THE HASHES", "pip config debug")),
-        ("python: No module named pip\n", ("No module named pip", "ensurepip")),
-        ("", ("no reason given",)),
-    ],
-)
+@pytest.mark.parametrize(("stderr", "words"), [
+    ("x\nERROR: THESE DO NOT MATCH THE HASHES\nmore", ("DO NOT MATCH THE HASHES", "pip config debug")),
+    ("python: No module named pip\n", ("No module named pip", "ensurepip")),
+    ("", ("no reason given",)),
+])  # fmt: skip
 def test_pip_that_fails_is_told(stderr, words, tmp_path, monkeypatch, capsys):
     asked = []
 

@@ -22,18 +22,15 @@ def settings(**tables):
     return config.from_dict({"scene": {"file": "sphere", "width": 24}, "renderer": {"pixels": 150}} | tables)
 
 
-@pytest.mark.parametrize(
-    ("tables", "most"),
-    [
-        ({}, working_size.PIXELS),
-        ({"renderer": {"pixels": 100}, "representation": {"kind": "pixels"}}, 100),
-        ({"representation": {"kind": "siren"}}, None),
-        ({"optimizer": {"kind": "adam"}}, None),
-        ({"renderer": {"kind": "path"}}, None),
-        ({"representation": {"cycles": 12}}, working_size.PIXELS),
-        ({"representation": {"cycles": 48}}, None),
-    ],
-)
+@pytest.mark.parametrize(("tables", "most"), [
+    ({}, working_size.PIXELS),
+    ({"renderer": {"pixels": 100}, "representation": {"kind": "pixels"}}, 100),
+    ({"representation": {"kind": "siren"}}, None),
+    ({"optimizer": {"kind": "adam"}}, None),
+    ({"renderer": {"kind": "path"}}, None),
+    ({"representation": {"cycles": 12}}, working_size.PIXELS),
+    ({"representation": {"cycles": 48}}, None),
+])  # fmt: skip
 def test_only_gauss_newton_is_solved_on_fewer_pixels_unless_they_are_asked_for(tables, most):
     assert working_size.most_pixels(config.from_dict(tables)) == most
 

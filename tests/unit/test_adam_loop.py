@@ -25,8 +25,7 @@ def test_rows_are_placed_and_all_others_keep_their_bits(first, rows, rng):
     expected = original.copy()
     expected[first : first + rows] = crop
     placed = adam_loop.place_rows(mi.TensorXf(original), mi.TensorXf(crop), first)
-    assert placed.shape == original.shape
-    assert placed.numpy().tobytes() == expected.tobytes()
+    assert placed.shape == original.shape and placed.numpy().tobytes() == expected.tobytes()
 
 
 @pytest.mark.parametrize(("first", "rows"), [(0, 3), (2, 3), (0, 6)])
@@ -179,8 +178,7 @@ def test_observer_is_told_of_every_row_and_of_the_end(rng):
     arguments, _ = case(rng, iterations=25)
     seen = []
     adam_loop.optimise(*arguments, after_step=lambda s, adam: seen.append((s.step, len(s.history))))
-    assert seen[-1] == (25, 25) and len(seen) >= 3
-    assert all(step == rows for step, rows in seen)
+    assert seen[-1] == (25, 25) and len(seen) >= 3 and all(step == rows for step, rows in seen)
 
 
 def test_what_an_observer_raises_ends_the_run(rng):

@@ -201,8 +201,7 @@ def test_maps_are_turned_upright(orientation, tmp_path, rng):
     found, info = images.load_envmap(path)
     np.testing.assert_array_equal(found, images.load_envmap(png(tmp_path / "u.png", upright))[0])
     told = f"turned upright, as its EXIF orientation {orientation} says"
-    assert (told in info["warnings"]) is (orientation > 1)
-    assert info["size"] == (8, 4)
+    assert (told in info["warnings"]) is (orientation > 1) and info["size"] == (8, 4)
 
 
 @pytest.mark.parametrize("gamma", [100_000, 55_556, 45_455, 45_000, 0])

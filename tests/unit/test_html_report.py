@@ -92,8 +92,7 @@ def test_report_draws_which_lights_moved_stayed_came_and_went(tmp_path):
     after = [light(1, 20, 30, added=False), light(3, 180, 60, added=True)]
     page = write(tmp_path / "b.html", lights={"before": before, "after": after})
     source = (tmp_path / "b.html").read_text()
-    assert "numbered as in lights.json" in page.text
-    assert page.tags.count("circle") == 4
+    assert "numbered as in lights.json" in page.text and page.tags.count("circle") == 4
     # Over the edge of the map, from both sides of it.
     assert 'x1="350.0" x2="380.0" y1="50.0" y2="60.0"' in source
     assert 'x1="-10.0" x2="20.0" y1="50.0" y2="60.0"' in source
@@ -134,8 +133,7 @@ def test_report_of_a_known_map_and_a_failed_edit(tmp_path):
     page = write(tmp_path / "r.html", metrics=metrics, maps=maps)
     assert "map against the true one: 9.9 dB → 12.3 dB" in page.text
     assert "unedited map edited map PSNR (dB) 20 15 9.87 12.34" in page.text
-    assert "further from the target" in page.text
-    assert "target 16 × 8 1e+06 3, 5" in page.text
+    assert "further from the target" in page.text and "target 16 × 8 1e+06 3, 5" in page.text
 
 
 def test_report_escapes_all_text(tmp_path):
@@ -145,8 +143,7 @@ def test_report_escapes_all_text(tmp_path):
     changes |= {"lights": {"before": [], "after": [light(1, 20, 30)]}, "warnings": [nasty], "notes": [nasty]}
     settings = config.Config(scene=config.Scene(file=file))
     page = write(tmp_path / "r.html", settings, {nasty: nasty}, **changes)
-    assert "script" not in page.tags
-    assert page.text.count("<script>alert('&')</script> Gemälde/заря") == 8
+    assert "script" not in page.tags and page.text.count("<script>alert('&')</script> Gemälde/заря") == 8
     assert page.text.count(file) == 3  # title, heading and configuration
 
 
@@ -185,5 +182,4 @@ def test_map_statistics_weight_the_mean_by_solid_angle():
     cells = html_tables.map_statistics(image)
     # Eight of 33 rows aligned to the corners are a cap of angle pi * 7.5 / 32 around the pole.
     mean = 2.0 * (1 - np.cos(np.pi * 7.5 / 32)) / 2
-    assert cells[:4] == ["64 × 33", "2", "0, 0", f"{mean:.4g}"]
-    assert cells[4:] == ["0", "0"]
+    assert cells[:4] == ["64 × 33", "2", "0, 0", f"{mean:.4g}"] and cells[4:] == ["0", "0"]

@@ -84,12 +84,10 @@ def test_exactly_the_rectangle_is_painted(kind, name, initial, tmp_path):
     assert found.picture[~where].tobytes() == initial[~where].tobytes()
     if step:  # right to half a step of display values, with float32 rounding
         error = tonemap(found.picture[where], name) - tonemap(wanted[where], name)
-        assert np.abs(error).max() <= 0.5 * step + 1e-6
-        assert not found.excluded[where].any()
+        assert np.abs(error).max() <= 0.5 * step + 1e-6 and not found.excluded[where].any()
     else:
         room = {"exr": 0, "half": 6e-4, "hdr": 1 / 128}[kind] * wanted[where].max(axis=1, keepdims=True)
-        assert (np.abs(found.picture[where] - wanted[where]) <= room).all()
-        assert not found.excluded.any()
+        assert (np.abs(found.picture[where] - wanted[where]) <= room).all() and not found.excluded.any()
     assert "%" not in told(found)
 
 
@@ -570,8 +568,7 @@ def test_exported_and_painted_on(ending, name, initial, tmp_path):
     stored = info["metadata"]
     assert [str(stored[f"envedit.{k}"]) for k in ("scene", "envmap", "seed")] == ["sphere", "auto", "3"]
     used = name if name in ("log", "reinhard") else "reinhard"
-    assert stored["envedit.tonemap"] == ("linear" if ending == ".exr" else used)
-    assert not told_now
+    assert stored["envedit.tonemap"] == ("linear" if ending == ".exr" else used) and not told_now
     refused(["nothing of it is painted"], file, SIZE, "auto", initial)
     if ending == ".exr":
         np.testing.assert_array_equal(pixels, initial)

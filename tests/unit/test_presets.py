@@ -133,10 +133,8 @@ def test_paths_are_relative_to_the_file_and_names_that_are_no_paths_stay(tmp_pat
     (folder / "edit.v2.toml").write_bytes(b"\xef\xbb\xbf" + text.replace("\n", "\r\n").encode())
     config = cfg.load("project/edit.v2.toml", overrides=["target.mask=n.png"])
     assert config.input.envmap == str(folder / "maps/sky.exr")
-    assert config.scene.file == str(folder / "room.xml")
-    assert config.target.file == "/abs/t.png"
-    assert config.target.mask == str(folder / "n.png")
-    assert config.output.dir == str(folder / "edit.v2_out")
+    assert config.scene.file == str(folder / "room.xml") and config.target.file == "/abs/t.png"
+    assert config.target.mask == str(folder / "n.png") and config.output.dir == str(folder / "edit.v2_out")
     config = cfg.loads("[scene]\nfile = 'mirror'", base_dir="/d")
     assert config.scene.file == "mirror" and config.input.envmap == "auto" and config.target.file == ""
     config = cfg.loads("[scene]\nfile = './mirror'\n[input]\nenvmap = './sunsky'", base_dir="/d")

@@ -47,8 +47,7 @@ def checked(m, rows=None):
     d = latlong.directions(total, m.shape[1])[first : first + m.shape[0]]
     glow, core = np.ones_like(s.glow), np.zeros_like(s.core).reshape(-1, 3)
     for light in s.lights:
-        assert abs(np.linalg.norm(light.direction) - 1) < 1e-12
-        assert len(light.texels)
+        assert abs(np.linalg.norm(light.direction) - 1) < 1e-12 and len(light.texels)
         assert not core[light.texels].any(), "a texel belongs to one light"
         core[light.texels] = light.radiance
         if light.glow is not None:

@@ -197,8 +197,7 @@ def test_a_picture_of_the_scene_is_read_as_linear_radiance(ball, pictured, tmp_p
     assert made.weight is None and made.warnings == () and len(made.asked) == 1
     srgb = of_a_picture(ball, pictured, file=str(png(tmp_path / "a.png", shown_as_srgb(picture))))
     step = np.maximum(picture, 0.1) ** (1 - 1 / 2.4) / 255  # a step of 8 bits, and more
-    assert (np.abs(srgb.picture - picture) < 1.5 * step).all()
-    assert srgb.weight is None
+    assert (np.abs(srgb.picture - picture) < 1.5 * step).all() and srgb.weight is None
     named = of_a_picture(ball, pictured, file=str(tmp_path / "a.png"), tonemap="gamma")
     np.testing.assert_allclose(named.picture, (shown_as_srgb(picture) / 255) ** 2.2, rtol=1e-4)
     array = target.make(asking(kind="rendering", file=images.ARRAY), ball, envmap, picture)

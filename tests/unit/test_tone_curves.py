@@ -10,8 +10,7 @@ from envedit.core.tone_curves import TONE_CURVES
 def test_a_curve_rises_from_black_to_white_keeps_grey_and_is_undone(name, rng):
     grey = np.repeat(np.append(0, np.geomspace(1e-4, 200, 300))[:, None], 3, axis=1)
     shown = TONE_CURVES[name].shown(grey)
-    assert (np.diff(shown, axis=0) >= -1e-6).all()
-    assert shown[0].max() < 0.01 and shown[-1].min() > 0.97
+    assert (np.diff(shown, axis=0) >= -1e-6).all() and shown[0].max() < 0.01 and shown[-1].min() > 0.97
     assert np.ptp(shown, axis=1).max() < 5e-3
     curve = TONE_CURVES[name]
     radiance = np.exp(rng.normal(-1.5, 1, (500, 3)))

@@ -52,6 +52,5 @@ def test_replacing_a_field_is_checked_as_well():
 
 def test_numbers_are_normalised():
     config = cfg.from_dict({"fit": {"lr": np.float32(0.5), "epochs": np.int64(3)}, "loss": {"ssim": [1, 2]}})
-    assert type(config.fit.lr) is float and type(config.fit.epochs) is int
-    assert config.loss.ssim == (1.0, 2.0)
+    assert type(config.fit.lr) is float and type(config.fit.epochs) is int and config.loss.ssim == (1.0, 2.0)
     assert type(cfg.loads("[fit]\nlr = 1").fit.lr) is float

@@ -39,8 +39,7 @@ def test_a_large_film_is_made_smaller_and_keeps_its_aspect():
     lit = scene.load("sphere", 48, 24)
     for pixels, size in ((1 << 20, (48, 24)), (700, (48, 24)), (288, (24, 12)), (70, (12, 6))):
         small = working_size.smaller(settings(renderer={"pixels": pixels}), lit)
-        assert (small.width, small.height) == size
-        assert (small is lit) == (size == (48, 24))
+        assert (small.width, small.height) == size and (small is lit) == (size == (48, 24))
 
 
 def test_a_crop_is_made_smaller_and_what_takes_no_other_size_stays_as_it_is(tmp_path):

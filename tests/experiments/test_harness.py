@@ -1,6 +1,5 @@
 """Experiments: cases that are run once, tables and sheets of what is done, the shared command line."""
 
-import argparse
 import json
 import math
 import re
@@ -10,7 +9,7 @@ import numpy as np
 import pytest
 
 import experiments.__main__ as command
-from envedit import config, sweep
+from envedit import config
 from envedit.core.errors import ConfigError, InputError
 from experiments import harness
 from experiments.harness import Case, Done, Experiment, markdown, montage
@@ -177,12 +176,3 @@ def test_experiments_are_listed_and_an_unknown_one_is_named(capsys):
     assert [line.split()[0] for line in lines] == list(command.modules())
     assert command.main(["layer"]) == 2
     assert re.search("got layer, expected one of .*interiors, layers", capsys.readouterr().err)
-
-
-def test_the_same_options_everywhere():
-    parser = argparse.ArgumentParser()
-    harness.add_options(parser, harness.Path("runs/x"))
-    given = parser.parse_args(["--set", "a.b=1", "--set", "c=2", "--only", "x", "y", "--scheduler", "h:1"])
-    assert (given.sets, given.only, given.scheduler) == (["a.b=1", "c=2"], ["x", "y"], "h:1")
-
-    assert Case("x", {}).command == sweep.COMMAND

@@ -179,19 +179,6 @@ def test_without_maps_an_error_says_where_they_come_from(build, tmp_path, monkey
 
 
 # ---- the command line --------------------------------------------------------------------------------------
-def test_usage(maps, tmp_path, capsys):
-    options = ["paper", "run", "table1", "--out", str(tmp_path / "out")]
-    only = ["--only", "ours-pixels-autumn", "ours-layers", "--dry-run"]
-    assert main([*options, *only]) == 0 and not (tmp_path / "out").exists()
-    assert "2 jobs: 2 missing" in capsys.readouterr().out
-    assert main(["paper", "table", *options[2:]]) == 0
-    kept = (tmp_path / "out" / "table1.md").read_text()
-    assert capsys.readouterr().out == kept and "no case is done" in kept
-    with pytest.raises(SystemExit) as info:
-        main(["paper", "run", "table4"])
-    assert info.value.code == 2
-
-
 # ---- tables and pictures of what is done -------------------------------------------------------------------
 
 SOME = {"psnr": 20.0, "ssim": 0.5, "mse": 0.01, "lpips": None}

@@ -56,13 +56,6 @@ def test_entries_and_sizes(home, capsys):
     assert lines(capsys)[0].endswith("0 entries, 0.0 MB")
 
 
-def test_what_is_kept_after_emptying_is_used_again(home):
-    keep("fits", 1, 10)
-    assert cache.main(["--empty"]) == 0 and DiskCache(cache_folder("fits")).load({"number": 0}) is None
-    keep("fits", 1, 10)
-    assert DiskCache(cache_folder("fits")).load({"number": 0}).keys() == {"a"}
-
-
 @pytest.mark.parametrize("what", ["unlink", "iterdir"])
 def test_what_cannot_be_deleted_or_read_is_named(what, home, capsys, monkeypatch):
     file = keep("transport", 1, 10)[0]

@@ -117,14 +117,6 @@ def test_column_indices_survive_as_bits_of_a_float():
     np.testing.assert_array_equal(np.array(matrix.apply(x)).ravel(), [1, 2, 3])
 
 
-def test_product_has_the_same_bits_every_time(rng):
-    rows, columns, weights = entries(rng, (300, 40), 5000)
-    x = rng.standard_normal((40, 3)).astype(np.float32)
-    first = product(ColourMatrix(rows, columns, weights, (300, 40)), x)
-    for _ in range(3):
-        np.testing.assert_array_equal(product(ColourMatrix(rows, columns, weights, (300, 40)), x), first)
-
-
 @pytest.mark.parametrize(
     "shape, count", [((37, 101), 200), ((9, 4), 0), ((1, 5), 3), ((64, 1), 20), ((300, 7), 900), ((16, 9), 1)]
 )

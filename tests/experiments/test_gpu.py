@@ -25,7 +25,7 @@ def steps(monkeypatch):
     return made
 
 
-def test_both_variants_are_measured_and_stand_beside_each_other(tmp_path, steps, capsys):
+def test_both_variants_are_measured_and_without_a_gpu_the_cpu_alone(tmp_path, steps, capsys):
     out = tmp_path / "gpu.json"
     steps["solver", "llvm_ad_rgb"] = {"error": "slow"}  # the CPU is only there to compare with
     assert gpu.main([str(out), "--small"]) == 0
@@ -33,9 +33,6 @@ def test_both_variants_are_measured_and_stand_beside_each_other(tmp_path, steps,
     assert list(found["steps"]) == ["doctor", "quickstart", "engine", "solver", "fit"]
     assert all(list(one) == ["cuda_ad_rgb", "llvm_ad_rgb"] for one in found["steps"].values())
     assert found["machine"]["cores"] and "cuda_ad_rgb fit: 1.0 s" in capsys.readouterr().out
-
-
-def test_without_a_gpu_the_cpu_is_measured_and_the_exit_code_says_so(tmp_path, steps):
     steps["doctor", "cuda_ad_rgb"] = {"error": "no GPU"}
     assert gpu.main([str(tmp_path / "gpu.json"), "--small"]) == 1
     found = json.loads((tmp_path / "gpu.json").read_text())["steps"]

@@ -29,7 +29,7 @@ def example(rng):
     return state, optimiser, renderer
 
 
-def test_everything_comes_back_exactly(tmp_path, rng):
+def test_everything_comes_back_exactly_also_without_a_renderer_and_with_bad_steps(tmp_path, rng):
     state, optimiser, renderer = example(rng)
     checkpoint.save(tmp_path, "what", state, optimiser, renderer, PICTURE)
     found = checkpoint.load(tmp_path, "what")
@@ -37,9 +37,6 @@ def test_everything_comes_back_exactly(tmp_path, rng):
     assert same_bits(optimiser, found[1]) and same_bits(renderer, found[2])
     assert np.array_equal(found[3], PICTURE)
     assert [path.name for path in tmp_path.iterdir()] == [checkpoint.NAME]
-
-
-def test_a_renderer_without_state_and_a_history_with_bad_steps(tmp_path, rng):
     _, optimiser, _ = example(rng)
     state = State(1, 1, 1, 0.5, [{"iteration": 0, "loss": math.nan}, {"iteration": 1, "loss": math.inf}])
     checkpoint.save(tmp_path, "what", state, optimiser, {}, PICTURE)

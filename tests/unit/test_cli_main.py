@@ -76,15 +76,12 @@ def test_a_shipped_configuration_by_name(name, here):
     assert settings == config.load(file, None, [f"output.dir={here}/runs/{stem}"])
 
 
-def test_paths_given_beside_a_name_start_from_the_working_folder(here):
+def test_paths_and_results_beside_a_shipped_configuration_lie_in_the_working_folder(here):
     overrides = ["input.envmap=sky.hdr", "scene.file=my/scene.xml", "output.dir=elsewhere"]
     settings, _, _ = run.load("quickstart", "paper", overrides)
     found = settings.input.envmap, settings.scene.file, settings.output.dir
     assert found == tuple(str(here / name) for name in ("sky.hdr", "my/scene.xml", "elsewhere"))
     assert settings.preset == "paper"
-
-
-def test_a_shipped_configuration_by_its_path_keeps_the_results_out_of_its_folder(here):
     file = shipped.folder() / "edits" / "warmer.toml"
     settings, _, base = run.load(str(file), None, [])
     assert settings.output.dir == str(here / "runs" / "warmer") and base == file.parent

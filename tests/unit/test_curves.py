@@ -21,7 +21,7 @@ def points_of(svg, name):
     return [(p[0], float(p[1:]), float(y)) for p, y in zip(pen[::2], pen[1::2], strict=True)]
 
 
-def test_curve_is_straight_for_a_geometric_series():
+def test_curve_is_straight_for_a_geometric_series_and_interrupted_where_there_is_no_value():
     rows = [{"iteration": 10 * i, "loss": 0.5**i, "ssim": 0.25 * 0.5**i, "lr": 1e-4} for i in range(9)]
     points = points_of(curves.curves_svg(rows), "loss")
     steps = np.diff([(x, y) for _, x, y in points], axis=0)
@@ -30,9 +30,6 @@ def test_curve_is_straight_for_a_geometric_series():
     lower = points_of(curves.curves_svg(rows), "ssim")
     assert lower[0][2] == pytest.approx(points[2][2], abs=0.11), "0.25 stands where 0.5^2 does"
     assert "lr" not in curves.curves_svg(rows)
-
-
-def test_curve_is_interrupted_where_there_is_no_value():
     values = [1.0, 0.5, np.nan, 0.25, None, 0.0, -1.0, 0.2, np.inf, "text", 0.1]
     svg = curves.curves_svg([{"iteration": i, "loss": v} for i, v in enumerate(values)])
     assert [move for move, _, _ in points_of(svg, "loss")] == ["M", "L", "M", "M", "M"]

@@ -17,12 +17,9 @@ def even(density):
     return (density * sphere).astype(np.float32)
 
 
-def test_texels_of_the_poles_count_by_their_size():
+def test_texels_count_by_solid_angle_and_below_a_share_of_the_mean_are_not_determined():
     np.testing.assert_allclose(per_solid_angle(even(3.0)), 3.0, rtol=1e-6)
     assert determined(even(1.0), PLENTY, EVERY, 0.9).all()
-
-
-def test_texels_below_a_share_of_the_mean_of_the_active_rows_are_not_determined():
     density = np.ones((HEIGHT, WIDTH))
     density[16:] = 0.01
     found = determined(even(density), PLENTY, EVERY, 0.05)

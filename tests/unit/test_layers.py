@@ -174,7 +174,7 @@ def test_black_channel_is_brightened_by_the_veil(factor):
 
 
 # ---- texels that are kept --------------------------------------------------------------------------------
-def test_kept_texels_keep_their_bits_under_any_gain(rng, sunny):
+def test_kept_texels_keep_their_bits_under_any_gain_and_lights_move_into_them(rng, sunny):
     free = rng.random(SHAPE) < 0.4
     made, params = sunny
     before = made.decode(params).numpy()
@@ -184,9 +184,6 @@ def test_kept_texels_keep_their_bits_under_any_gain(rng, sunny):
     np.testing.assert_array_equal(got[free], made.decode(changed).numpy()[free])
     assert (got[free] != before[free]).mean() > 0.9
     assert (made.decode(changed).numpy()[~free] != before[~free]).mean() > 0.9  # negative control
-
-
-def test_light_moves_into_kept_texels(sunny):
     made, params = sunny
     there = sent(made, params, latlong.directions(*SHAPE)[40, 60])
     made = made.keeping(np.zeros(SHAPE, bool))

@@ -80,13 +80,10 @@ def test_irradiance_of_an_even_sky_is_pi():
     np.testing.assert_allclose(map_lights.irradiance(even, normals), 2 * math.pi, rtol=1e-3)
 
 
-def test_a_black_map_has_no_lights(tmp_path, capsys):
+def test_a_black_map_has_no_lights_and_bad_input_is_one_line(tmp_path, capsys):
     sky, alone, _ = written(np.zeros((6, 12, 3), np.float32), tmp_path)
     assert not sky.any() and not alone.any()
     assert json.loads(capsys.readouterr().out)["lights"] == []
-
-
-def test_bad_input_is_one_line(tmp_path, capsys):
     assert lights.main([str(tmp_path / "none.exr"), "--json"]) == 3
     out, err = capsys.readouterr()
     assert "no such file" in json.loads(out)["error"] and len(err.splitlines()) == 1

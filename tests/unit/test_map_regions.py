@@ -50,7 +50,7 @@ def test_a_brush_is_a_cap_of_the_sphere_at_poles_and_seam(centre):
     assert (got[away < 20 - 1e-6] == 1).all() and (got[away > 20 + texel] == 0).all()
 
 
-def test_polygons_go_around_and_across_the_edge():
+def test_polygons_go_around_and_across_the_edge_and_dots_are_in_the_nearest_texel():
     assert (weight({"polygon": WHOLE}) == 1).all()
     low = weight({"polygon": [[0, -90], [360, -90], [360, -60], [0, -60]]})
     elevation = np.linspace(90, -90, SHAPE[0])
@@ -58,9 +58,6 @@ def test_polygons_go_around_and_across_the_edge():
     here = weight({"polygon": [[350, -20], [370, -20], [370, 20], [350, 20]]})
     there = weight({"polygon": [[170, -20], [190, -20], [190, 20], [170, 20]]})
     assert np.allclose(np.roll(here, SHAPE[1] // 2, axis=1), there, atol=1e-6)
-
-
-def test_a_region_smaller_than_a_texel_is_in_the_nearest():
     got = weight(brush("keep", 100.0, 0.0, 0.01))
     assert 0 < got.max() < 1 and np.count_nonzero(got) <= 4
 
@@ -92,7 +89,7 @@ def test_a_filling_continues_its_surroundings(centre, radius, error):
     assert np.abs(filled / smooth - 1)[inside == 1].max() < error
 
 
-def test_a_filling_of_black_and_beside_a_sun_is_finite():
+def test_a_filling_of_black_and_beside_a_sun_is_finite_and_needs_opencv(monkeypatch):
     pytest.importorskip("cv2")
     region = brush("fill", 100.0, 10.0, 8.0)
     black = np.zeros((*SHAPE, 3), np.float32)
@@ -103,9 +100,6 @@ def test_a_filling_of_black_and_beside_a_sun_is_finite():
     assert np.isfinite(filled).all() and filled.min() >= 1e-6 * (1 - 1e-5) and filled.max() <= 65504
     with pytest.raises(ConfigError, match=r"regions\[0\]: covers the whole map"):
         map_regions.changed(bright, [{"action": "fill", "softness": 0.0, "polygon": WHOLE}])
-
-
-def test_without_opencv_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "cv2", None)
     with pytest.raises(MachineError, match=r"'.\[inpaint\]'"):
         map_regions.changed(np.ones((*SHAPE, 3), np.float32), [brush("fill", 0.0, 0.0, 9.0)])

@@ -18,15 +18,12 @@ def sky(rng, height=32, width=64):
     return (0.2 + rng.random((height, width, 3))).astype(np.float32)
 
 
-def test_psnr_and_mse_of_a_known_error():
+def test_psnr_and_mse_of_a_known_error_under_the_tonemap_that_is_stated():
     a = np.zeros((4, 5, 3))
     assert metrics.mse(a + 0.1, a) == pytest.approx(0.01)
     assert metrics.psnr(a + 0.1, a) == pytest.approx(20)
     assert metrics.psnr(a + 0.1, a, data_range=10) == pytest.approx(40)
     assert metrics.psnr(a + 1e6, a) == pytest.approx(-120)
-
-
-def test_compare_states_its_tonemap():
     a, b = np.full((16, 16, 3), 0.25, np.float32), np.full((16, 16, 3), 3.0, np.float32)
     result = metrics.compare(a, b)
     error = (1 - 0.25 ** (1 / 2.2)) ** 2
@@ -82,15 +79,12 @@ def test_the_share_beyond_the_display_is_of_what_differs(rng):
     assert metrics.compare(b, a, seen=seen)["beyond_display"] == 0
 
 
-def test_sun_offset_goes_through_the_seam(rng):
+def test_ratios_and_the_offset_of_the_sun(rng):
     a, b = sky(rng), sky(rng)
     a[5, 1], b[8, 61] = 1e4, 2e4
     assert metrics.peak_position(a) == (5, 1)
     assert metrics.sun_offset(a, b) == metrics.sun_offset(b, a) == 5  # 3 rows, 4 columns
     assert metrics.peak_ratio(a, b) == pytest.approx(0.5)
-
-
-def test_ratios():
     a = np.zeros((4, 8, 3))
     b = a + 0.5
     assert metrics.mean_luminance_ratio(b, 2 * b) == pytest.approx(0.5)

@@ -182,16 +182,13 @@ def test_without_the_rendering_all_is_painted(initial, tmp_path):
     np.testing.assert_array_equal(found.excluded, (codes(initial) == 255).any(axis=2))
 
 
-def test_faint_radiance_is_painted_too(tmp_path):
+def test_faint_radiance_is_paint_and_a_sun_that_a_half_cannot_hold_is_none(tmp_path):
     initial = np.full((8, 8, 3), 1e-4, np.float32)
     wanted = initial.copy()
     wanted[2, 3] *= 1.01
     wanted[5, 5] = 0
     found = painted_image.read(floats(tmp_path / "p.exr", wanted), (8, 8), "gamma", initial)
     assert set(zip(*np.nonzero(found.coverage[..., 0]), strict=True)) == {(2, 3), (5, 5)}
-
-
-def test_a_sun_that_a_half_cannot_hold_is_no_paint(tmp_path):
     initial = np.full((8, 8, 3), 0.5, np.float32)
     initial[1, 1] = 1e6
     wanted = np.minimum(initial, 65504)
@@ -442,21 +439,18 @@ def test_interlaced(tmp_path):
     np.testing.assert_allclose(found[..., 2], [[60001, 60002], [60003, 60004]], rtol=1e-6)
 
 
-def test_cmyk_is_refused(initial, tmp_path):
+def test_cmyk_and_another_size_are_refused(initial, tmp_path):
     frame = bytes([8]) + struct.pack(">HH", *SIZE) + bytes([4]) + bytes(12)
     data = b"\xff\xd8\xff\xc0" + struct.pack(">H", len(frame) + 2) + frame
     (tmp_path / "p.jpg").write_bytes(data + b"\xff\xda\0\2")
     refused(["p.jpg", "4 channels", "CMYK", "RGB"], tmp_path / "p.jpg", SIZE, "gamma", initial)
-
-
-# ---- refused -----------------------------------------------------------------------------------------------
-def test_another_size(initial, tmp_path):
     file = png(tmp_path / "p.png", codes(initial)[:40])
     refused(["is 83x40 pixels", "83x60", "aspect", "--export-initial"], file, SIZE, "gamma", initial)
     file = png(tmp_path / "p.png", codes(initial)[:1, :1])
     refused(["is 1x1 pixels", "83x60", "more than 16 times"], file, SIZE, "gamma", initial)
 
 
+# ---- refused -----------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("factor", [2, 1.5, 0.5])
 @pytest.mark.parametrize("method", ["NEAREST", "BILINEAR", "BICUBIC", "LANCZOS"])
 def test_a_resized_picture_is_resampled(method, factor, initial, tmp_path):

@@ -63,14 +63,11 @@ def test_a_lens_that_darkens_corners_is_undone(lit, tmp_path):
     assert plain[0, 0].mean() < 0.5 * fitting.picture[0, 0].mean()
 
 
-def test_what_is_given_of_the_camera_stays(lit, tmp_path):
+def test_what_is_given_of_the_camera_stays_and_linear_files_have_no_curve(lit, tmp_path):
     file = taken(lit, tmp_path / "photo.png", Camera("srgb", FACTOR))
     found = made(lit, file, exposure=1.0, white_balance=4000.0).photo.camera
     assert found.stops == pytest.approx(1.0, abs=1e-6) and found.kelvin == pytest.approx(4000, rel=0.01)
     assert found.curve == "srgb"
-
-
-def test_linear_files_have_no_curve_and_no_white(lit, tmp_path):
     images.write_exr(tmp_path / "photo.exr", 8 * lit[2], panorama=False)
     photo = made(lit, tmp_path / "photo.exr").photo
     assert photo.curves == ("linear",) and not photo.clipped.any()

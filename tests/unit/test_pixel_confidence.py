@@ -37,14 +37,11 @@ def test_a_caustic_counts_less_and_the_rest_as_before(rng):
     assert found[:, :16].min() > 0.99
 
 
-def test_a_second_recording_of_more_samples_leaves_more_of_the_noise_to_the_first(rng):
+def test_more_samples_leave_more_noise_to_the_first_and_the_target_s_own_counts(rng):
     (first, second), base = pictures(rng)
     first[10:13, 20:23] += 0.1
     few, many = (pixel_confidence.weights(first, second, share, base) for share in (1 / 2, 2))
     assert many[11, 21] < few[11, 21] < 0.5
-
-
-def test_the_target_s_own_noise_counts_too(rng):
     (first, second), base = pictures(rng)
     noise = np.full(SHAPE[:2], 0.002)
     noise[4, 5] = 0.5

@@ -32,13 +32,10 @@ def test_directions_and_angles_are_inverse():
     assert (row, column) == (pytest.approx(45 / 180 * 31), pytest.approx(90 / 360 * 64 - 0.5))
 
 
-def test_nothing_asked_changes_no_bit(sky):
+def test_nothing_asked_changes_no_bit_and_a_map_is_levelled_as_by_envedit_adjust(sky):
     assert PlacedLights(sky).place([]) is sky
     same = PlacedLights(sky).place([{"light": 1, "flux": [1.0] * 3, "size": 1.0}])
     assert np.array_equal(same, sky)
-
-
-def test_a_map_is_levelled_as_envedit_adjust_levels_it(sky):
     keys = {"rotate_degrees": 100.0, "tilt_degrees": 8.0, "horizon_degrees": -5.0}
     levelled = inputs.read_map(config.Input(envmap="sunsky", width=64, **keys), None, 64)
     expected, _ = adjusted(sky, Adjustments(turn=100.0, tilt=8.0, horizon=-5.0))

@@ -33,7 +33,7 @@ def test_the_paper_preset_spells_out_every_number_of_the_method():
         assert set(presets.PRESETS["paper"][table]) == keys - left_out, table
 
 
-def test_default_then_preset_then_file_then_override():
+def test_default_then_preset_then_file_then_override_key_by_key():
     assert cfg.loads("").fit.epochs == 1200
     assert cfg.loads('preset = "draft"').fit.epochs == 500
     assert cfg.loads('preset = "draft"\n[fit]\nepochs = 7').fit.epochs == 7
@@ -44,9 +44,6 @@ def test_default_then_preset_then_file_then_override():
     assert cfg.loads('preset = "draft"', overrides=["preset=paper"]).preset == "paper"
     config = cfg.loads('preset = "draft"', preset="standard", overrides=["preset=paper"])
     assert config.preset == "standard" and config.fit.epochs == 1200
-
-
-def test_scene_parameters_are_merged_key_by_key():
     config = cfg.loads("[scene.parameters]\na = 1\nb = true", overrides=["scene.parameters.a=glossy"])
     assert config.scene.parameters == {"a": "glossy", "b": True}
 

@@ -73,15 +73,12 @@ def test_without_noise_it_was_not_painted_on_the_rendering(sphere):
     assert tell(sphere, lit.render(np.roll(envmap, 5, axis=1), spp=529, seed=7))[0]
 
 
-def test_where_part_of_it_is_the_rendering_it_was_painted(sphere):
+def test_what_is_the_rendering_in_part_or_black_was_painted(sphere):
     """No other rendering is asked for."""
     picture = np.roll(sphere[3], 3, axis=0)
     picture[:16] = sphere[2][:16]
     assert tell(sphere, picture) == (False, 0)
     assert tell(sphere, sphere[2]) == (False, 0)
-
-
-def test_black_renderings_say_nothing(sphere):
     black = np.zeros((*FILM, 3), np.float32)
     assert not rendered_anew.is_rendered_anew(black + 1, black, np.ones((*FILM, 1)), lambda: black)
 

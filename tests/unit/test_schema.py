@@ -118,16 +118,13 @@ def test_keys_of_many_parts_are_refused_before_they_are_parsed():
     assert cfg.loads(f"# {'a word. ' * 300}\n[input]\nenvmap = 'a.b.c/../..' # {'.' * 500}").input.envmap
 
 
-def test_a_refusal_is_short_whatever_the_file_holds():
+def test_a_refusal_is_short_and_names_the_override_it_came_from():
     long = "a" * 5000
     assert "known: preset" in refused(f"{long} = 1")
     assert "[fit] has no key 'aaa" in refused(f"[fit]\n{long} = 1")
     twice = refused(f"[{long}]\n[{long}]")
     assert "Cannot declare" in twice and twice.endswith("(at line 2, column 5002)")
     assert "seed" in refused(f"seed = '{long}'")
-
-
-def test_an_error_names_the_override_it_came_from():
     assert refused("", "fit.epochs=-3").startswith("--set 'fit.epochs=-3': fit.epochs: got -3, expected")
     assert "did you mean epochs?" in refused("", "fit.epoch=3")
     assert "expected a table" in refused("", "fit=3")

@@ -69,13 +69,10 @@ def test_soft_shapes_cover_the_same_share_at_any_resolution(shape, softness):
     assert small == pytest.approx(large, rel=1e-3)
 
 
-def test_a_picture_made_small_is_the_small_picture():
+def test_a_picture_made_small_is_the_small_picture_and_hairlines_keep_their_share():
     for shape, _ in AREAS:
         fine = covered(512, softness=0.03, **shape).reshape(128, 4, 128, 4).mean(axis=(1, 3))
         assert np.abs(fine - covered(128, softness=0.03, **shape)).max() < 0.01
-
-
-def test_hairlines_and_dots_smaller_than_a_pixel_keep_their_share():
     line = {"points": [[0.2, 0.2], [0.7, 0.63]], "width": 0.002}
     assert covered(64, **line).mean() == pytest.approx(0.002 * math.hypot(0.5, 0.43), rel=0.01)
     dot = {"ellipse": [0.502, 0.49, 0.004, 0.003]}
@@ -94,12 +91,15 @@ def test_pixels_have_their_centres_at_one_half_and_fractions_follow_width_and_he
     assert np.count_nonzero(dot[50] > 0.5) == np.count_nonzero(dot[:, 100] > 0.5) == 40
 
 
-def test_an_ellipse_turns_from_x_towards_y():
+def test_an_ellipse_turns_from_x_towards_y_and_a_crossed_polygon_has_a_hole():
     turned = covered(128, ellipse=[0.5, 0.5, 0.4, 0.05, 45])
     assert turned[90, 90] == 1 and turned[90, 37] == 0 and turned[37, 37] == 1
     # The turn is one of the picture's pixels, whatever its aspect: a quarter turn changes the two radii over.
     wide, tall = [0.5, 0.5, 0.2, 0.2, 90], [0.5, 0.5, 0.1, 0.4]
     np.testing.assert_allclose(covered(64, 128, ellipse=wide), covered(64, 128, ellipse=tall), atol=1e-6)
+    star = [[0.5 + 0.4 * math.sin(a), 0.5 - 0.4 * math.cos(a)] for a in np.arange(5) * 0.8 * math.pi]
+    c = covered(128, polygon=star)
+    assert c[64, 64] == 0 and c[24, 64] == 1
 
 
 def test_a_soft_edge_is_a_smooth_step_half_inside_and_half_outside():
@@ -111,12 +111,6 @@ def test_a_soft_edge_is_a_smooth_step_half_inside_and_half_outside():
     assert hard[19] == 0 and hard[20] == pytest.approx(0.5) and hard[21] == 1
     faint = covered(101, rectangle=[20.498, -200, 400, 400], softness=20, units="pixels")[50]
     assert faint[10] == 0 < faint[11]  # 3e-8, less than a pixel's float32 tells apart
-
-
-def test_a_polygon_that_crosses_itself_is_filled_by_the_even_odd_rule():
-    star = [[0.5 + 0.4 * math.sin(a), 0.5 - 0.4 * math.cos(a)] for a in np.arange(5) * 0.8 * math.pi]
-    c = covered(128, polygon=star)
-    assert c[64, 64] == 0 and c[24, 64] == 1
 
 
 def test_coverage_is_the_union_of_the_strokes():
@@ -147,7 +141,7 @@ def test_a_colour_is_given_as_numbers_or_as_on_a_display():
     assert StrokeList()([stroke]) == (stroke,)
 
 
-def test_a_shadow_is_a_factor_on_radiance_by_coverage_and_opacity():
+def test_a_shadow_is_a_factor_on_radiance_and_light_adds_to_it():
     picture = grey(2.0, 64, 64)  # above display white: a factor all the same
     soft = {"type": "shadow", "ellipse": [0.5, 0.5, 0.3, 0.3], "softness": 0.2, "amount": 0.75}
     c = covered(64, **soft)[..., None]
@@ -156,9 +150,6 @@ def test_a_shadow_is_a_factor_on_radiance_by_coverage_and_opacity():
         np.testing.assert_allclose(painted(picture, opacity=opacity, **soft), expected, rtol=1e-6)
     tinted = painted(picture, color=[0.5, 1, 2], **soft)
     np.testing.assert_allclose(tinted[32, 32], [0.25, 0.5, 1.0], rtol=1e-6)
-
-
-def test_light_adds_radiance_also_where_it_is_black():
     picture = grey(0.0, 32, 32)
     picture[16:] = 3
     lit = painted(picture, type="light", rectangle=BOX, amount=2, color=[1, 0.5, 0])

@@ -43,14 +43,11 @@ def test_values_out_of_type_or_range_are_refused_by_name(key, values):
         assert message.count("expected") == 1
 
 
-def test_replacing_a_field_is_checked_as_well():
+def test_replacing_a_field_is_checked_as_well_and_numbers_are_normalised():
     with pytest.raises(ConfigError, match=r"fit\.epochs: got -1, expected an integer from 0"):
         dataclasses.replace(cfg.Fit(), epochs=-1)
     with pytest.raises(ConfigError, match=r"fit: got 3, expected a table"):
         cfg.Config(fit=3)
-
-
-def test_numbers_are_normalised():
     config = cfg.from_dict({"fit": {"lr": np.float32(0.5), "epochs": np.int64(3)}, "loss": {"ssim": [1, 2]}})
     assert type(config.fit.lr) is float and type(config.fit.epochs) is int and config.loss.ssim == (1.0, 2.0)
     assert type(cfg.loads("[fit]\nlr = 1").fit.lr) is float

@@ -306,10 +306,8 @@ def test_a_write_that_comes_short_leaves_no_file(name, tmp_path):
     data = path.read_bytes()
     path.unlink()
     for size in (0, 100, len(data) // 2, len(data) - 100, len(data) - 1):
-        with (
-            pytest.raises(InputError, match=f"{name}: cannot be written .File too large."),
-            largest_file(size),
-        ):
+        said = f"{name}: cannot be written .File too large."
+        with pytest.raises(InputError, match=said), largest_file(size):
             WRITERS[name](path)
         assert names(tmp_path) == set()
     with largest_file(len(data)):

@@ -67,7 +67,7 @@ def test_grids_double_and_are_as_fine_in_elevation_as_in_azimuth(cycles, share):
 
 @pytest.mark.parametrize("cycles, share", GAINS)
 @pytest.mark.parametrize("shape", SHAPES)
-def test_hats_are_a_partition_of_unity(cycles, share, shape):
+def test_hats_are_a_partition_of_unity_and_the_field_is_their_interpolation(cycles, share, shape, rng):
     g = gain.GridGain(cycles, share)
     for level in range(len(g.sizes)):
         taps = g.hats(level, shape)
@@ -80,12 +80,6 @@ def test_hats_are_a_partition_of_unity(cycles, share, shape):
         np.testing.assert_allclose(sum(weight for _, weight in taps), 1, rtol=1e-12)
         ones = {n: np.full_like(v, n == f"gain.{level}") for n, v in g.init().items()}
         np.testing.assert_allclose(field(g, ones, shape), 1, rtol=1e-6)
-
-
-@pytest.mark.parametrize("cycles, share", GAINS)
-@pytest.mark.parametrize("shape", SHAPES)
-def test_field_is_the_interpolation_of_its_grids(cycles, share, shape, rng):
-    g = gain.GridGain(cycles, share)
     params = random(g, rng)
     expected = sum(interpolated(grid, shape, poles(share)) for grid in params.values())
     # Twelve products of numbers of order 1, rounded to float32.

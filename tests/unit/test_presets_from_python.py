@@ -50,6 +50,10 @@ def test_replacing_the_representation_brings_its_defaults_and_keeps_what_was_giv
     assert replaced == Config(preset=preset, representation=other, **tables)
     assert replaced.optimizer.iterations == 7 and replaced.input.width == 64
     assert replaced.loss.ssim == (1.0 if preset != "paper" else (1.0, 1e4))
+    read = config.loads(f'preset = "{preset}"\n[output]\ndir = "/out"\n[optimizer]\niterations = 7\n')
+    replaced = replace(read, representation=Representation("pixels"))
+    tables = {"optimizer": {"iterations": 7}, "representation": {"kind": "pixels"}}
+    assert replaced == config.from_dict({"preset": preset, "output": OUT} | tables)
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -61,11 +65,3 @@ def test_replacing_one_key_of_a_table_keeps_all_others(preset):
     other = replace(made, optimizer=replace(made.optimizer, lr=0.25))
     assert replace(other, optimizer=made.optimizer) == made and other.optimizer.lr == 0.25
     assert other.optimizer.iterations == made.optimizer.iterations
-
-
-@pytest.mark.parametrize("preset", PRESETS)
-def test_what_was_read_from_toml_is_replaced_alike(preset):
-    read = config.loads(f'preset = "{preset}"\n[output]\ndir = "/out"\n[optimizer]\niterations = 7\n')
-    replaced = replace(read, representation=Representation("pixels"))
-    tables = {"optimizer": {"iterations": 7}, "representation": {"kind": "pixels"}}
-    assert replaced == config.from_dict({"preset": preset, "output": OUT} | tables)

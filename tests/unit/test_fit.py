@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from envedit import config
-from envedit.core.errors import NumericalError
+from envedit.core.errors import InputError, NumericalError
 from envedit.losses import metrics, ssim
 from envedit.representations.siren import fit
 from envedit.representations.siren import network as siren
@@ -441,6 +441,10 @@ def test_seconds_of_a_killed_fit_count(tmp_path, monkeypatch, rng):
     assert undisturbed.seconds > 40 * 100 and abs(continued.seconds - undisturbed.seconds) <= 400
 
 
-def test_a_fit_that_ends_in_nan_is_refused_as_what_it_is(rng):
+def test_a_fit_that_ends_in_nan_or_begins_with_it_is_refused_as_what_it_is(rng):
+    image = sky(rng)
     with pytest.raises(NumericalError, match=r"not finite; lower \[fit\] lr"):
-        fit.fit(sky(rng), NETWORK, config.Fit(epochs=4, lr=1e37, awp_gamma=0.0))
+        fit.fit(image, NETWORK, config.Fit(epochs=4, lr=1e37, awp_gamma=0.0))
+    image[2, 3, 1] = np.nan
+    with pytest.raises(InputError, match="row 2, column 3"):
+        fit.fit(image, NETWORK, QUICK)

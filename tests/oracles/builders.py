@@ -29,6 +29,16 @@ def stacked(p):
     return np.stack([p[c] for c in "RGB"], -1).astype(np.float32)
 
 
+def floats(path, picture, dtype=np.float32, **more):
+    """Write a picture (H, W, 3) as OpenEXR, past the package: also one that is not finite."""
+    return exr(path, **{c: np.ascontiguousarray(picture[..., i], dtype) for i, c in enumerate("RGB")}, **more)
+
+
+def png(path, values):
+    mi.Bitmap(np.ascontiguousarray(values)).write(str(path))
+    return path
+
+
 def grey(value, height=8, width=16):
     return np.full((height, width, 3), value, np.float32)
 

@@ -12,7 +12,7 @@ from envedit.scene import scene
 from envedit.solve import adam_loop
 from envedit.targets import painted_image
 from envedit.transport.light_transport import LightTransport
-from tests.oracles.builders import exr
+from tests.oracles.builders import floats
 from tests.oracles.extremes_stages import (
     FILM,
     Outcome,
@@ -26,7 +26,6 @@ from tests.oracles.extremes_stages import (
     sky,
     ssim_rounding,
     transport,
-    write_plain,
 )
 from tests.oracles.plain import IDENTICAL
 
@@ -137,9 +136,8 @@ def _transparent(alpha, light=2.0):
     """Paint light times the rendering, with alpha, in an OpenEXR file."""
 
     def act(folder):
-        paint = (alpha * light * initial()).astype(np.float32)
-        planes = {c: np.ascontiguousarray(paint[..., i]) for i, c in enumerate("RGB")}
-        path = exr(folder / "p.exr", A=np.full(SHAPE, alpha, np.float32), **planes)
+        paint = alpha * light * initial()
+        path = floats(folder / "p.exr", paint, A=np.full(SHAPE, alpha, np.float32))
         found = painted_image.read(path, SHAPE, "gamma", initial())
         np.testing.assert_allclose(found.coverage, alpha, rtol=1e-6)
         mixed = (alpha * light + 1 - alpha) * initial().astype(np.float64)
@@ -168,7 +166,7 @@ def _clipped(share):
 def _not_finite_file(folder):
     picture = initial().copy()
     picture[2, 3, 1] = np.nan
-    painted_image.read(write_plain(folder / "p.exr", picture), SHAPE, "gamma", initial())
+    painted_image.read(floats(folder / "p.exr", picture), SHAPE, "gamma", initial())
 
 
 def done(says):

@@ -323,7 +323,7 @@ def test_paint_that_a_result_is_farther_from_is_a_warning(tmp_path, rng, capsys)
     path = world(tmp_path, rng, target={"kind": "strokes", "strokes": [stroke]}, output={"exposure": -3.0})
     assert call(path, "--quiet", "--out", tmp_path / "out") == 0
     said = capsys.readouterr().err
-    assert "the result is farther from the target than the input where painted: " in said
+    assert "the result is farther from the target than the input: -" in said
     assert measured(tmp_path / "out")["worse"] is True
 
 

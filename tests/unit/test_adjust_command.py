@@ -101,7 +101,7 @@ def test_the_command_keeps_format_and_colour_space_and_writes_a_backplate(rng, c
 @pytest.mark.parametrize(("options", "code", "says"), [
     ([], 2, "nothing to adjust: give one of --turn"),
     (["--blur", "1", "--out", "sky.hdr"], 2, "sky.hdr: is read by this command"),
-    (["--blur", "1", "--background-blur", "2"], 2, "need --background FILE"),
+    (["--blur", "1", "--background-blur", "2"], 2, "need --background OUT"),
     (["--blur", "1", "--out", "a.exr", "--background", "a.exr"], 2, "where the map itself goes"),
     (["--exposure", "100", "--out", "a.exr"], 5, "leaves float32"),
 ])  # fmt: skip

@@ -101,7 +101,7 @@ def test_lights_are_softened_where_there_are_some(rng):
     envmap = sunny(rng)
     found, notes = adjusted(envmap, lights={"soften_degrees": 8.0})
     np.testing.assert_allclose(flux(found), flux(envmap), rtol=1e-5)
-    assert notes == ["1 lights softened by 8 degrees"] and found[12, 3].max() < 0.1 * envmap[12, 3].max()
+    assert notes == ["1 light softened by 8 degrees"] and found[12, 3].max() < 0.1 * envmap[12, 3].max()
     envmap = np.full((HEIGHT, WIDTH, 3), 0.5, np.float32)
     found, notes = adjusted(envmap, lights={"soften_degrees": 8.0})
     np.testing.assert_array_equal(found, envmap)

@@ -55,6 +55,7 @@ def test_the_same_files_on_any_number_of_threads(kind, renderer, tmp_path, rng, 
     warm = carried_out(path, 2, cache=tmp_path / "cache-1")  # fit and recording come from disk
     assert differing(one, two) == set() == differing(one, warm)
     assert pixels(one / "edited.exr").tobytes() != pixels(tmp_path / "map.exr").tobytes()
+    assert (one / "influence.exr").exists() == (renderer == "transport")
 
 
 def test_a_wide_pixel_filter_and_odd_numbers_of_samples_give_the_same_files(tmp_path, rng, carried_out):

@@ -1004,21 +1004,6 @@ def test_saturation_comes_back_from_a_checkpoint_of_its_state(rng):
     assert run.state["saturation"].tolist() == state["saturation"].tolist()
 
 
-def test_problems_of_one_job_share_their_blocks_and_nothing_else(rng):
-    """The second problem has another target, and the bits of one that has made its own blocks."""
-    image, transport = clouds(rng) + lamp(), DenseTransport.random(rng, FILM, GRID)
-    first, params = problem_of(image, transport, shown(transport, image))
-    first.normal(first.evaluate(first.state(params)), first.state(params), 0.01)
-    target = shown(transport, 1.2 * image)
-    again = Problem(first.layers, transport, image, target, blocks=first.blocks)
-    alone = Problem(first.layers, transport, image, target)
-    assert again.blocks is first.blocks and alone.blocks is not first.blocks
-    state = again.state(params)
-    one, other = (p.normal(p.evaluate(state), state, 0.01) for p in (again, alone))
-    assert one.gradient.any() and one.gradient.tobytes() == other.gradient.tobytes()
-    assert one.hessian.tobytes() == other.hessian.tobytes()
-
-
 @pytest.mark.slow
 def test_draws_vary_as_much_as_is_open(rng):
     """Their standard deviation is the posterior's, to the noise of 200; a seed has one draw."""

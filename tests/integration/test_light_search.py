@@ -119,13 +119,6 @@ def test_the_map_that_is_found_gives_the_picture(transport, moved):
 # ---- lights that stay, go and come -----------------------------------------------------------------------
 
 
-def test_a_picture_that_is_there_already_changes_nothing(transport):
-    image = sky(SUN)
-    found = Found(transport(), image, picture(transport(), image))
-    assert found.name == "lights left where they are" and [*found.lit] == [0]
-    np.testing.assert_allclose(found.decoded, image[:ROWS], rtol=0.02)
-
-
 def test_a_sun_that_the_picture_does_not_show_disappears(transport):
     found = Found(transport(), sky(SUN), picture(transport(), sky()))
     assert not found.lit or found.flux[0].max() < 0.05

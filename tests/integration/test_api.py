@@ -32,7 +32,6 @@ TINY = {
 
 
 def ball(texels, scale=2.0):
-    """Return the dict of a scene: a sphere under a map of its own."""
     turned = mi.ScalarTransform4f().rotate([0, 1, 0], 30)
     look = mi.ScalarTransform4f().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0])
     return {

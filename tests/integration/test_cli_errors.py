@@ -19,7 +19,6 @@ pytestmark = pytest.mark.usefixtures("isolated")
 
 @pytest.fixture
 def path(tmp_path, rng):
-    """Return a configuration that would run."""
     return world(tmp_path, rng)
 
 

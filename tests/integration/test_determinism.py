@@ -34,7 +34,6 @@ def carried_out(tmp_path, monkeypatch, threads):
 
 
 def error(one, other):
-    """Return the largest relative difference of the edited maps."""
     a, b = (pixels(folder / "edited.exr").astype(np.float64) for folder in (one, other))
     return float((np.abs(a - b) / np.maximum(a, 1e-3)).max())
 

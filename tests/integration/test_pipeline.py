@@ -377,7 +377,6 @@ class Stub:
 
 
 def with_networks(monkeypatch, dists, lpips):
-    """Let runs have networks without weights."""
     monkeypatch.setattr(
         installed,
         "load",
@@ -478,7 +477,6 @@ MIRROR = {
 
 
 def detailed(rng):
-    """Return a map of 64x32 texels whose detail a mirror shows."""
     return np.exp(rng.normal(0, 0.5, (32, 64, 1)) + rng.normal(0, 0.1, (32, 64, 3))).astype(np.float32)
 
 

@@ -26,7 +26,6 @@ def here(tmp_path, monkeypatch):
 
 
 def small():
-    """Return the options of a short run."""
     keys = {f"{table}__{key}": value for table, keys in TINY.items() for key, value in keys.items()}
     return changed(**keys | {"scene__width": 16, "optimizer__iterations": 1})
 

@@ -208,29 +208,6 @@ def test_the_judged_rendering_is_what_mitsuba_makes_of_the_written_file(tmp_path
 
 
 @pytest.mark.slow
-def test_a_painted_target_has_no_known_map(tmp_path, rng):
-    path = world(tmp_path, rng, target={"kind": "image", "file": "painted.exr", "mask": "mask.png"})
-    images.write_exr(tmp_path / "painted.exr", np.full((18, 24, 3), 0.5, np.float32))
-    images.write_png(tmp_path / "mask.png", np.ones((18, 24, 3)))
-    assert call(path, "--quiet") == 0
-    out = tmp_path / "c_out"
-    found = measured(out)
-    assert found["envmap"] is None and found["render"]["psnr"] > 0
-    assert (pixels(out / "render_target.exr") == 0.5).all()
-    inputs = json.loads((out / "manifest.json").read_text())["inputs"]
-    assert set(inputs) == {"envmap", "scene", "target", "mask"}
-
-
-@pytest.mark.slow
-def test_the_shipped_sky_and_scene_need_no_files(tmp_path, rng):
-    path = world(tmp_path, rng, **PIXELS, input={"envmap": "sunsky", "width": 16}, scene={"file": "matte"})
-    assert call(path, "--quiet", *changed(optimizer__iterations=1)) == 0
-    inputs = json.loads((tmp_path / "c_out" / "manifest.json").read_text())["inputs"]
-    shipped = next(p for p in (ROOT / "scenes", ROOT / "envedit" / "scenes") if p.is_dir()) / "matte.xml"
-    assert inputs["scene"]["sha256"] == hashlib.sha256(shipped.read_bytes()).hexdigest()
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("value", [0.0, 1e-30])
 @pytest.mark.parametrize("kind", ["layers", "siren", "pixels", "log-pixels"])
 def test_a_map_without_light_is_edited_all_the_same(value, kind, tmp_path, rng, capsys):

@@ -23,7 +23,6 @@ STROKE = {"type": "shadow", "rectangle": [0.3, 0.3, 0.7, 0.7], "amount": 0.5}
 
 
 def source(rng):
-    """Return a map of 64 x 32 with a sun."""
     picture = (0.5 + 0.05 * rng.random((WIDTH // 2, WIDTH, 3))).astype(np.float32)
     picture[6, 20:22] = 400
     return picture

@@ -153,7 +153,6 @@ def files(folder):
 
 
 def output(driver):
-    """What a driver writes until it ends."""
     return driver.communicate(timeout=LIMIT_SECONDS)[0]
 
 

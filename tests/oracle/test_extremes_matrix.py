@@ -100,20 +100,14 @@ def test_pixels_hold_what_logarithms_cannot():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("value", "error", "says"), [
-    (1e10, None, ""),
-    (1e30, None, ""),
-    (3e38, InputError, "layers: 1 texels are brighter than 1.27e[+]30, the first at row 2, column 5"),
-])  # fmt: skip
-def test_whole_runs_end_finite_or_with_a_reason(value, error, says, tmp_path):
+def test_whole_runs_end_finite_or_with_a_reason(tmp_path):
     m = extremes.sky(8, 16)
-    m[2, 5] = value
-    settings = settings_of(tmp_path, m, target={"rotate_degrees": 90.0}, input={"rows": "all"})
-    if error:
-        with pytest.raises(error, match=says):
-            pipeline.run(settings)
-        return
-    result = pipeline.run(settings)
+    asked = {"target": {"rotate_degrees": 90.0}, "input": {"rows": "all"}}
+    m[2, 5] = 3e38
+    with pytest.raises(InputError, match="layers: 1 texels are brighter than 1.27e[+]30, .* row 2, column 5"):
+        pipeline.run(settings_of(tmp_path, m, **asked))
+    m[2, 5] = 1e30
+    result = pipeline.run(settings_of(tmp_path, m, **asked))
     assert np.isfinite(result.envmap).all() and result.metrics["non_finite_steps"] == 0
 
 

@@ -23,7 +23,6 @@ SCENES = ROOT / "scenes"
 
 @pytest.fixture
 def loaded(tmp_path):
-    """A ball under a map."""
     return scene.load(write_scene(tmp_path, SENSOR, BALL, LIGHT))
 
 

@@ -50,7 +50,6 @@ def with_chunk(path, kind, data):
 
 
 def turned(orientation):
-    """Return EXIF data that says so."""
     entry = struct.pack(">HHIHH", 274, 3, 1, orientation, 0)
     return b"MM\0*" + struct.pack(">IH", 8, 1) + entry + bytes(4)
 

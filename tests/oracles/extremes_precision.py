@@ -50,7 +50,6 @@ def error(got, wanted, beside=None) -> float:
 
 @functools.cache
 def pair(scale, shape=(16, 32, 3)):
-    """Return two random images up to ``scale``, float32."""
     rng = np.random.default_rng(7)
     return tuple((scale * rng.random(shape)).astype(np.float32) for _ in range(2))
 
@@ -63,7 +62,6 @@ def wild(shape=(16, 32, 3)):
 
 
 def sunny(sun=1e6, below=1e-3):
-    """Return a sun over a dim sky, a megapixel."""
     m = np.full((512, 512, 3), below, np.float32)
     m[100, 200] = sun
     return m
@@ -76,8 +74,6 @@ def _cases(name):
 
 
 def _loss(name, part):
-    """Measure the value of a loss, part 0, or its gradient, part 1."""
-
     def measure():
         return max(
             error(loss_and_gradient(name, x, y)[part], plain(name, x, y)[part]) for x, y in _cases(name)

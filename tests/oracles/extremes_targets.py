@@ -37,12 +37,10 @@ STEPS = 10
 
 @functools.cache
 def initial():
-    """Render the sky of the matrix: the picture that is painted on."""
     return transport(16, 32).apply(single(sky())).numpy()
 
 
 def traced():
-    """Trace T of the matrix, without columns."""
     return LightTransport.build(matte(), 16, 32, spp=16, max_depth=3)
 
 

@@ -11,7 +11,7 @@ import pytest
 from envedit.cli import run
 from envedit.images import images
 from tests.oracles import ROOT
-from tests.oracles.builders import LIGHT, SENSOR, exr, sky, write_scene
+from tests.oracles.builders import exr, sky
 from tests.oracles.runs import call, changed, names, pixels, world
 
 pytestmark = pytest.mark.usefixtures("isolated")
@@ -111,14 +111,6 @@ def test_texels_that_are_not_finite(path, capsys, tmp_path, rng):
     assert np.isfinite(edited).all()
     good[6, 2] = False
     assert edited[4:][good[4:]].tobytes() == picture[4:][good[4:]].tobytes()
-
-
-@pytest.mark.slow
-def test_a_scene_that_sees_no_light(path, capsys, tmp_path):
-    inside = '<shape type="sphere"><float name="radius" value="50"/></shape>'
-    write_scene(tmp_path, SENSOR, inside, LIGHT, name="scene.xml")
-    said = fails(3, capsys, path)
-    assert "scene.xml" in said and "no pixel receives light" in said
 
 
 @pytest.mark.parametrize(

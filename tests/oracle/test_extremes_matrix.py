@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from envedit import pipeline
-from envedit.core import latlong, radiance
+from envedit.core import latlong
 from envedit.core.errors import InputError
 from envedit.images import images
 from envedit.representations import LogPixels, Pixels
@@ -65,22 +65,6 @@ def test_the_page_is_current():
 
 
 # ---- refusals ----------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(("value", "says"), [
-    (np.nan, "sky: 2 texels are not finite, the first at row 11, column 3: repair the map"),
-    (-np.inf, "sky: 2 texels are not finite, the first at row 11, column 3: repair the map"),
-    (-1e-30, "sky: 2 texels are negative, the first at row 11, column 3: set them to 0"),
-    (2e30, r"sky: 2 texels are brighter than 1.27e\+30, the first at row 11, column 3: scale the map down"),
-])  # fmt: skip
-def test_what_is_no_radiance_is_refused_by_row_and_column(value, says):
-    m = np.ones((4, 8, 3), np.float32)
-    m[1, 3, 2] = m[2, 0, 0] = value
-    with pytest.raises(InputError, match=f"^{says}$"):
-        radiance.require_radiance(m, "sky", 10, radiance.BRIGHTEST)
-    radiance.require_radiance(np.full((4, 8, 3), 1.2e30, np.float32), "sky", 10, radiance.BRIGHTEST)
-    radiance.require_radiance(np.full((4, 8, 3), 3e38, np.float32), "sky")
-    radiance.require_radiance(-np.zeros((4, 8, 3), np.float32), "sky")
 
 
 def test_rows_of_a_refusal_are_those_of_the_map():

@@ -246,12 +246,6 @@ def test_a_broken_scene_is_told_in_short(tmp_path, parts, says):
     assert "test.xml" in text and len(text.splitlines()) <= 2 and not re.search(r"\.cpp:", text), text
 
 
-def test_a_damaged_mesh_is_an_input_error(tmp_path):
-    (tmp_path / "a.ply").write_bytes(b"ply\nformat nonsense\n\x00")
-    with pytest.raises(InputError, match="a.ply"):
-        scene.load(write_scene(tmp_path, SENSOR, MESH, LIGHT))
-
-
 @pytest.mark.parametrize(
     "name, says",
     [

@@ -482,28 +482,6 @@ def followed(problem, params, **options):
     return solution, last
 
 
-@pytest.mark.slow
-def test_a_change_that_layers_can_make_is_found(rng):
-    image = clouds(rng) + lamp()
-    transport = DenseTransport.random(rng, (20, 24), GRID, even=0.5)
-    layers = Layers.of(image, cycles=3)
-    params = layers.start()
-    nodes = params["gain.0"].numpy() + 0.5 * rng.normal(0, 1, params["gain.0"].shape[:2])[..., None]
-    turned = np.zeros((3, 3), np.float32)
-    centre = layers.lights.centres[0]
-    end = rotated(centre, np.array([0.0, np.radians(5), 0.0]))
-    turned[0] = rotation_vector(centre, end) / layers.scales["turn"]
-    true = layers.decode(
-        params | {"gain.0": mi.TensorXf(nodes.astype(np.float32)), "turn": mi.TensorXf(turned)}
-    )
-    problem, params = problem_of(image, transport, shown(transport, true.numpy()))
-    solution, last = followed(problem, params)
-    start = problem.evaluate(problem.state(params))
-    assert np.abs(last.residual).mean() < 0.05 * np.abs(start.residual).mean()
-    assert problem.direction(last.state, 0) @ end > np.cos(np.radians(1.0))
-    assert 3 <= len(solution.history) <= gauss_newton.MOST_STEPS
-
-
 def test_scale_is_that_of_the_residual_and_falls_by_half_at_most(case):
     problem, params, start, _ = case
     solution, last = followed(problem, params, sigma=0.05, iterations=30)

@@ -215,14 +215,6 @@ def test_automatic_depth_is_that_of_the_scene():
     assert build(plane, max_depth=5, spp=16).bounces == 4
 
 
-@pytest.mark.slow
-def test_influence_is_what_a_texel_adds_to_the_picture():
-    t = build(load("matte"), 6, 12)
-    ones = mi.TensorXf(np.ones((*t.shape, 3), np.float32))
-    # Sums of some thousand positive numbers in float32.
-    np.testing.assert_allclose(t.influence, t.adjoint(ones).numpy().mean(axis=2), rtol=1e-4)
-
-
 # ---- a linear operation and its adjoint --------------------------------------------------------------------
 
 

@@ -124,10 +124,6 @@ def test_least_sizes(backbones):
     least = {kind: backbones[kind].least_size() for kind in KINDS}
     assert least == {"vgg": 16, "alex": 31, "squeeze": 17}
     assert backbones["vgg"].least_size("hanning") == 1
-    with pytest.raises(
-        InputError, match="image of 40 rows and 30 columns: too small for AlexNet; it needs 31"
-    ):
-        backbones["alex"].stack(40, 30)
     for kind, n in least.items():
         taps, _ = pulled(backbones[kind], "max", np.ones((n, n, 3)), None)
         assert len(taps[-1]) >= 1 and np.isfinite(taps[-1]).all()

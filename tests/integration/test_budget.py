@@ -85,6 +85,11 @@ def test_active_rows_stay_the_same_part_of_the_sky(rows, wanted):
     assert budget._at_width(config.Input(envmap="sunsky"), 64).rows == "all"
 
 
+def test_a_picture_keeps_its_shape():
+    assert budget._film_at(config.Scene(width=256, height=64), 128) == config.Scene(width=128, height=32)
+    assert budget._film_at(config.Scene(width=256, height=4), 32).height == 1
+
+
 @pytest.fixture
 def small(tmp_path, rng, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))

@@ -69,6 +69,11 @@ def test_the_command_prints_versions_and_returns_the_exit_code(monkeypatch):
     assert len(done.stderr.splitlines()) == 2 and "Traceback" not in done.stderr
 
 
+def test_main_reports_a_healthy_machine(monkeypatch, capsys, healthy):
+    monkeypatch.setattr(doctor, "check", lambda variant: healthy)
+    assert doctor.main([]) == 0 and "llvm_ad_rgb" in capsys.readouterr().out
+
+
 # ---- the memory of a success -------------------------------------------------------------------------------
 
 
@@ -127,6 +132,7 @@ def test_a_cache_that_cannot_be_written_is_no_error(monkeypatch, cache, tmp_path
         (None, "", "did not end in"),
         (1, "ImportError: ... because the LLVM shared library", "no LLVM library was found"),
         (1, "Traceback\nValueError: odd", "ValueError: odd"),
+        (1, "", "it said nothing"),
     ],
 )
 def test_how_the_child_ended_is_told_on_one_line_and_what_to_do_on_another(code, said, says, monkeypatch):

@@ -316,6 +316,12 @@ def test_rows_that_fill_no_cell_of_the_block_transport_can_be_edited(rows, tmp_p
 
 
 @pytest.mark.slow
+def test_an_asked_for_loss_that_is_off_is_told(tmp_path, rng):
+    found = pipeline.run(settings_of(tmp_path, smooth(rng), loss={"dists": 0.6}, **PIXELS))
+    assert any("DISTS" in line and "loss.dists" in line for line in found.warnings)
+
+
+@pytest.mark.slow
 def test_a_siren_says_how_to_get_weights_and_has_dists_where_they_are(tmp_path, rng, monkeypatch):
     few = {"representation": {"kind": "siren", "hidden": 16, "depth": 1}, "fit": {"epochs": 20}}
     few["optimizer"] = {"iterations": 2}

@@ -547,6 +547,11 @@ def test_the_initial_rendering_is_exported_and_nothing_else(tmp_path, rng, capsy
     assert np.abs(read_png(tmp_path / "b.png") - expected).max() <= 1
 
 
+def test_the_export_says_how_the_file_is_named_in_a_configuration(tmp_path, rng, capsys):
+    assert call(world(tmp_path, rng), "--export-initial", tmp_path / "b.png") == 0
+    assert f'file = "{tmp_path / "b.png"}"' in capsys.readouterr().out
+
+
 def test_a_dry_run_writes_the_target_and_nothing_else(tmp_path, rng, capsys):
     stroke = {"type": "light", "rectangle": [0, 0, 0.5, 1], "amount": 0.25, "color": "#ffffff"}
     path = world(tmp_path, rng, target={"kind": "strokes", "strokes": [stroke]})

@@ -59,14 +59,7 @@ def with_chunk(path, kind, data):
     return path
 
 
-def with_segment(path, marker, data):
-    raw = path.read_bytes()
-    path.write_bytes(raw[:2] + bytes([255, marker]) + struct.pack(">H", len(data) + 2) + data + raw[2:])
-    return path
-
-
 def turned(orientation):
-    """Return EXIF data that says so."""
     entry = struct.pack(">HHIHH", 274, 3, 1, orientation, 0)
     return b"MM\0*" + struct.pack(">IH", 8, 1) + entry + bytes(4)
 

@@ -28,7 +28,7 @@ from tests.oracles.plain import IDENTICAL, single
 
 FILM = (8, 6)
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
-STEPS = 60
+STEPS = 25
 """Of the edit loop; it stops at the 20th that is not finite in a row."""
 
 
@@ -79,7 +79,6 @@ def close(got, wanted, relative: float, absolute: float = 0.0) -> None:
 
 @functools.cache
 def matte() -> scene.Scene:
-    """Load the shipped scene under a film of a few pixels."""
     return scene.load("matte", *FILM)
 
 

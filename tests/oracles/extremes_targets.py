@@ -36,12 +36,10 @@ STEPS = 10
 
 @functools.cache
 def initial():
-    """Render the sky of the matrix: the picture that is painted on."""
     return transport(16, 32).apply(single(sky())).numpy()
 
 
 def traced():
-    """Trace T of the matrix, without columns."""
     return LightTransport.build(matte(), 16, 32, spp=16, max_depth=3)
 
 
@@ -173,6 +171,9 @@ def done(says):
     return Outcome("done", says)
 
 
+NOT_FINITE = refused(
+    InputError, "target: pixel at row 2, column 3 is not finite: repair it where it comes from"
+)
 TARGETS = {
     "all black": (_even(0.0), done("Followed: light is taken away, the loss falls.")),
     "all white": (_even(1.0), done("Followed: light is added, the loss falls.")),
@@ -185,14 +186,8 @@ TARGETS = {
     ),
     "one pixel of 1e30": (_one(1e30), done("Followed; all other pixels count as not painted.")),
     "one pixel of -5": (_one(-5.0), done("As 0: nothing is darker than black.")),
-    "NaN, given as an array": (
-        _one(np.nan),
-        refused(InputError, "target: pixel at row 2, column 3 is not finite: repair it where it comes from"),
-    ),
-    "+Inf, given as an array": (
-        _one(np.inf),
-        refused(InputError, "target: pixel at row 2, column 3 is not finite: repair it where it comes from"),
-    ),
+    "NaN, given as an array": (_one(np.nan), NOT_FINITE),
+    "+Inf, given as an array": (_one(np.inf), NOT_FINITE),
     "NaN, in a file": (
         _not_finite_file,
         refused(

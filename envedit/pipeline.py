@@ -515,7 +515,7 @@ class _Edit:
         else:
             measures["worse"] = metrics.worse(*pair)
             nothing = metrics.off(pair[0], pair) and metrics.gained(*pair) < LEAST_GAIN
-            how = f"{after} from the target now, {before} before"
+            how = f"{after} now, {before} before"
         if measures["worse"]:
             self.warnings.append(
                 f"the result is farther from the target than the input: {how}; the edited map is kept "

@@ -50,6 +50,7 @@ def test_a_package_adds_three_kinds(installed):
     kinds = {"representation": "one_colour", "renderer": "few_bounces", "target": "brighter"}
     tables = {table: {**TABLES.get(table, {}), "kind": kind} for table, kind in kinds.items()}
     result = envedit.edit({**TABLES, **tables}, envmap=envmap)
+    assert not any("no effect" in warning for warning in result.warnings)
     ratio = result.envmap.sum(axis=(0, 1)) / envmap.sum(axis=(0, 1))
     # The target is lit twice as brightly; the map can only change by one factor a channel.
     np.testing.assert_allclose(ratio, 2, rtol=0.1)

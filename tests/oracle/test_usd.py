@@ -275,6 +275,25 @@ def test_irradiance_of_a_distant_light(normalize, angle, tmp_path):
     assert np.allclose(picture, np.multiply([1, 0.5, 0], irradiance / math.pi), rtol=0.02, atol=1e-9)
 
 
+@pytest.mark.parametrize(("scale", "kind"), [(0.5, "sphere"), (Gf.Vec3d(1, 0.4, 0.7), "ply")])
+def test_a_stretched_sphere_is_no_longer_round(scale, kind, tmp_path):
+    """The extent of what is seen, and normals that point outwards, as the picture under white light says."""
+    stage = new_stage(tmp_path)
+    add_camera(stage, move=(0, 0, 8))
+    ball = UsdGeom.Sphere.Define(stage, "/ball")
+    ball.GetRadiusAttr().Set(2.0)
+    place(ball, scale=scale)
+    found, _ = loaded(stage, 64)
+    (shape,) = found.mi.shapes()
+    box = shape.bbox()
+    expected = 2.0 * np.broadcast_to(np.array(scale, float), 3)
+    np.testing.assert_allclose([box.max.x, box.max.y, box.max.z], expected, rtol=0.002)
+    assert shape.is_mesh() == (kind == "ply")
+    picture = found.render(np.ones((4, 8, 3)), 64)[..., 0]
+    surface = picture[np.hypot(*(np.indices(picture.shape) - np.array(picture.shape)[:, None, None] / 2)) < 4]
+    np.testing.assert_allclose(surface, surface.mean(), rtol=0.1)
+
+
 @pytest.mark.parametrize("normalize", [False, True])
 @pytest.mark.parametrize("kind", ["RectLight", "DiskLight", "SphereLight", "point", "spot"])
 def test_light_of_a_lamp_far_away(kind, normalize, tmp_path):
@@ -537,7 +556,7 @@ def test_convert_overwrites_nothing_and_reports_in_json(tmp_path, capsys):
     assert convert.main([saved(stage), str(target), "--json"]) == 0
     facts = json.loads(capsys.readouterr().out)
     assert facts["ok"] and facts["files"] == {"made.xml": str(target)}
-    assert facts["warnings"] == ["shot.usda: depth of field (/camera)"]
+    assert facts["warnings"] == ["shot.usda: not read: depth of field (/camera)"]
     before = target.read_bytes()
     assert convert.main([saved(stage), str(target)]) == 3
     assert "exists already" in capsys.readouterr().err and target.read_bytes() == before

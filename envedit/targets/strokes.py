@@ -84,7 +84,9 @@ def paint(picture: np.ndarray, strokes: Sequence[dict], tonemap: str = "gamma") 
             continue
         covered = coverage(stroke, height, width)
         if not covered.any():
-            warnings.append(f"{name}: lies outside the {width}x{height} picture, nothing was painted")
+            outside = f"{name}: lies outside the {width}x{height} picture, nothing was painted"
+            hint = '; lengths in pixels need units = "pixels"' if stroke["units"] == "fraction" else ""
+            warnings.append(outside + hint)
             continue
         if stroke["type"] == "erase-shadow" and covered.all():
             warnings.append(f"{name}: covers the whole picture, no surroundings to paint with are left")

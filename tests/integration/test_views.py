@@ -130,7 +130,7 @@ def test_what_is_painted_belongs_to_a_view_and_the_others_hold(two):
     assert made.coverage[20:].any() and not made.coverage[:20].any()
     np.testing.assert_array_equal(made.picture[:20], made.initial[:20])
     first, white = made.warnings
-    assert first == "target.strokes[1] (light): lies outside the 40x30 picture, nothing was painted"
+    assert first.startswith("target.strokes[1] (light): lies outside the 40x30 picture")
     assert "of its pixels are white under the tonemap" in white
 
     for k, rows in enumerate(lit.rows):

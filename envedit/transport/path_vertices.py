@@ -46,10 +46,10 @@ class Block:
     path: mi.UInt32 | None = None
     pixel: mi.UInt32 | None = None
     start: mi.UInt32 | None = None  # (pixels + 1,), first vertex of each pixel
-    # texels, shares: (escapes,), texels around the direction of an escape, and their shares
-    texels: tuple[mi.UInt32, ...] = ()
-    shares: tuple[mi.Float, ...] = ()
-    light: tuple[mi.Float, ...] = ()  # (escapes,), what an escape adds for a radiance of 1
+    # texels, shares: (escapes,), the four texels around the direction of an escape, and their shares
+    texels: mi.Vector4u | None = None
+    shares: mi.Vector4f | None = None
+    light: mi.Color3f | None = None  # (escapes,), what an escape adds for a radiance of 1
     at: mi.UInt32 | None = None  # (escapes,), its pixel, from the picture's first
 
     @property
@@ -106,7 +106,7 @@ def _vertices(event, count, first):
     pixel = index // dr.opaque(mi.UInt32, count)
     path = index - pixel * dr.opaque(mi.UInt32, count)
     bounce = dr.opaque(mi.UInt32, event.bounce)
-    vertices = kept, throughput, bounce + 0 * index, path, pixel + dr.opaque(mi.UInt32, first)
+    vertices = *kept, throughput, bounce + 0 * index, path, pixel + dr.opaque(mi.UInt32, first)
     dr.make_opaque(vertices)  # literals would make other kernels
     return vertices
 
@@ -116,7 +116,7 @@ def _sort(block, parts):
     if not parts:
         return
     # By pixel and path each part is sorted: a vertex comes after those of earlier pixels and bounces.
-    pixels = [part[4] - dr.opaque(mi.UInt32, block.first) for part in parts]
+    pixels = [part[-1] - dr.opaque(mi.UInt32, block.first) for part in parts]
     counts = np.stack([_counted(pixel, block.pixels) for pixel in pixels])
     start = np.concatenate([[0], np.cumsum(counts.sum(axis=0))])
     offsets = start[:-1] + np.cumsum(counts, axis=0) - np.cumsum(counts, axis=1)
@@ -124,7 +124,8 @@ def _sort(block, parts):
         dr.arange(mi.UInt32, len(pixel)) + dr.gather(mi.UInt32, on_device(mi.UInt32, offset), pixel)
         for pixel, offset in zip(pixels, offsets.astype(np.uint32), strict=True)
     ]
-    block.hits, block.throughput, block.bounce, block.path, block.pixel = _joined(parts, places)
+    *hits, block.throughput, block.bounce, block.path, block.pixel = _joined(parts, places)
+    block.hits = tuple(hits)
     block.vertices = int(start[-1])
     block.start = on_device(mi.UInt32, start.astype(np.uint32))
 
@@ -150,7 +151,7 @@ def _escapes(event, grid, count, first):
     light = dr.gather(mi.Color3f, throughput, index) * (weight / dr.opaque(mi.Float, count))
     texels, shares = zip(*taps, strict=True)
     pixel = dr.opaque(mi.UInt32, first) + index // dr.opaque(mi.UInt32, count)
-    escapes = texels, shares, tuple(_of_first(light, some)), pixel
+    escapes = mi.Vector4u(*texels), mi.Vector4f(*shares), _of_first(light, some), pixel
     dr.eval(escapes)
     return escapes
 
@@ -158,7 +159,7 @@ def _escapes(event, grid, count, first):
 def _join(block, parts):
     if not parts:
         return
-    sizes = [len(part[3]) for part in parts]
+    sizes = [len(part[-1]) for part in parts]
     places = [
         dr.arange(mi.UInt32, size) + dr.opaque(mi.UInt32, start)
         for size, start in zip(sizes, np.cumsum([0, *sizes[:-1]]).tolist(), strict=True)
@@ -168,52 +169,17 @@ def _join(block, parts):
 
 
 def _joined(parts, places):
-    """Join structures of arrays member by member; ``places`` says where the elements of each come to lie.
+    """Join tuples of arrays member by member; ``places`` says where the elements of each come to lie.
 
     Not by ``dr.concat``, whose kernels have the sizes in them; and a single part too, for its literals would
     make other kernels later.
     """
-    leaves = [list(_leaves(part)) for part in parts]
     total = sum(len(place) for place in places)
-    joined = [dr.empty(type(leaf), total) for leaf in leaves[0]]
-    for place, members in zip(places, leaves, strict=True):
-        for target, leaf in zip(joined, members, strict=True):
-            dr.scatter(target, leaf, place)
+    joined = tuple(dr.empty(type(member), total) for member in parts[0])
+    for part, place in zip(parts, places, strict=True):
+        dr.scatter(joined, part, place)
     dr.eval(joined)
-    return _of_leaves(parts[0], iter(joined))
-
-
-def _leaves(value):
-    """Yield the flat arrays that a structure consists of; pointers as the numbers that they are."""
-    kind = type(value)
-    if kind is tuple:
-        for member in value:
-            yield from _leaves(member)
-    elif members := getattr(kind, "DRJIT_STRUCT", None):
-        for name in members:
-            yield from _leaves(getattr(value, name))
-    elif dr.depth_v(kind) > 1:
-        for member in value:
-            yield from _leaves(member)
-    else:
-        yield dr.reinterpret_array(mi.UInt32, value) if kind.__name__.endswith("Ptr") else value
-
-
-def _of_leaves(like, leaves):
-    """Put flat arrays together to a structure like another."""
-    kind = type(like)
-    if kind is tuple:
-        return tuple(_of_leaves(member, leaves) for member in like)
-    if members := getattr(kind, "DRJIT_STRUCT", None):
-        structure = kind()
-        for name in members:
-            setattr(structure, name, _of_leaves(getattr(like, name), leaves))
-        return structure
-    if dr.depth_v(kind) > 1:
-        members = [_of_leaves(member, leaves) for member in like]
-        return kind(*members) if members else like
-    leaf = next(leaves)
-    return dr.reinterpret_array(kind, leaf) if kind.__name__.endswith("Ptr") else leaf
+    return joined
 
 
 def on_device(kind: type[DrArray], values: np.ndarray) -> DrArray:

@@ -160,7 +160,7 @@ class _Edit:
         self.base = base
         self.watch = watch
         self.memory = memory
-        self.seeds = Seeds.of(settings.seed)
+        self.seeds = Seeds(settings.seed)
         self.notes: list[str] = []
         self.warnings: list[str] = []
         self.others: list[variants.Variant] = []

@@ -158,7 +158,7 @@ class Preparation:
             return None
         with self.clock("start_s"):
             self.watch.stage("testing turns of the sky")
-            seeds = Seeds.of(self.settings.seed)
+            seeds = Seeds(self.settings.seed)
             drawn = seeds.turn_check, seeds.target_again
             # A power of four, for as many strata across as down.
             spp = 4 ** (max(1, TURN_PATHS // (self.scene.width * self.scene.height)).bit_length() // 2)
@@ -191,7 +191,7 @@ class Preparation:
 
     def _shown(self, envmap, target, seed):
         """Render a map with as many samples as the target had."""
-        drawn = getattr(Seeds.of(self.settings.seed), seed)
+        drawn = getattr(Seeds(self.settings.seed), seed)
         spp = "auto" if self.settings.target.spp == "auto" else target.spp
         return rendered(self.scene, envmap, spp, drawn, self.settings.renderer.cache, target.spp)[0]
 

@@ -6,52 +6,38 @@ signs (:data:`SIGNS`) and the calibration of a budget are the same in every run.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 SIGNS = 0
 """Seed of random signs, by which sums over many texels are estimated."""
 _WORDS = 2**32  # where a seed is a setting of its own, or goes to Mitsuba as it is
 
 
-@dataclass(frozen=True)
 class Seeds:
-    """The seeds of a run; made by :meth:`of`."""
+    """The seeds of a run, derived from that of its configuration."""
 
-    fit: int  # a network and its fit
-    # T's recording, and the light of other lamps; further ones by :func:`recording`, :func:`pilot` and
-    # :func:`columns`. Of a path tracer, ``sample_tea_32(2 step, transport)``: rendering and gradient.
-    transport: int
-    second_recording: int  # T once more, to see what in it is noise
-    # step_check, turn_check, solution_check: renderings that decide about the solver's steps, and about the
-    # turn of the sky, and that show what T misses of the solution
-    step_check: int
-    turn_check: int
-    solution_check: int
-    # target, target_again: the target, rendered under another map; and renderings that show how noisy it is
-    target: int
-    target_again: int
-    exported: int  # the rendering that is painted on
-    painted_initial: int  # the initial rendering where a map is only adjusted, without a target
-    judged: int  # the rendering of the result, and the initial one that it is compared with: the same samples
-    page: int  # the rendering that the painting page shows; further passes count on from it
-
-    @classmethod
-    def of(cls, seed: int) -> Seeds:
-        """Derive all seeds from that of the configuration."""
-        return cls(
-            fit=seed,
-            transport=seed,
-            second_recording=(seed + 500_009) % _WORDS,
-            step_check=(seed + 700_001) % _WORDS,
-            turn_check=(seed + 800_011) % _WORDS,
-            solution_check=(seed + 900_001) % _WORDS,
-            target=seed + 7_000_003,
-            target_again=seed + 7_500_013,
-            exported=seed + 8_000_009,
-            painted_initial=seed + 9_000_011,
-            judged=seed + 9_000_012,
-            page=seed + 9_000_021,
-        )
+    def __init__(self, seed: int):
+        # Of a network and its fit
+        self.fit = seed
+        # T's recording, and the light of other lamps; further ones by :func:`recording`, :func:`pilot` and
+        # :func:`columns`. Of a path tracer, ``sample_tea_32(2 step, transport)``: rendering and gradient.
+        self.transport = seed
+        # T once more, to see what in it is noise
+        self.second_recording = (seed + 500_009) % _WORDS
+        # Renderings that decide about the solver's steps, and about the turn of the sky, and that show what T
+        # misses of the solution
+        self.step_check = (seed + 700_001) % _WORDS
+        self.turn_check = (seed + 800_011) % _WORDS
+        self.solution_check = (seed + 900_001) % _WORDS
+        # The target, rendered under another map; and renderings that show how noisy it is
+        self.target = seed + 7_000_003
+        self.target_again = seed + 7_500_013
+        # The rendering that is painted on
+        self.exported = seed + 8_000_009
+        # The initial rendering where a map is only adjusted, without a target
+        self.painted_initial = seed + 9_000_011
+        # The rendering of the result, and the initial one that it is compared with: the same samples
+        self.judged = seed + 9_000_012
+        # The rendering that the painting page shows; further passes count on from it
+        self.page = seed + 9_000_021
 
     def pass_of_page(self, i: int) -> int:
         """Return the seed of pass ``i`` of :attr:`page`."""

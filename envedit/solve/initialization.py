@@ -73,7 +73,7 @@ def recordings(
         return Recordings(transport)
     pixels, few = scene.width * scene.height, min(SECOND_SPP, transport.spp)
     second = trace(
-        Seeds.of(settings.seed).second_recording,
+        Seeds(settings.seed).second_recording,
         spp=few,
         max_depth=transport.bounces + 1,
         memory_gb=recording.gigabytes(pixels, few, min(SECOND_COLUMNS, transport.capacity) + 1),

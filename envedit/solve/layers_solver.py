@@ -300,7 +300,7 @@ class LayersSolver:
     def _display_error(self, envmap):
         """Return the mean square of display values of Mitsuba's rendering of a map less the target's."""
         target = self.edit.target
-        seed = Seeds.of(self.edit.settings.seed).step_check
+        seed = Seeds(self.edit.settings.seed).step_check
         shown = display_curve.values(self.edit.scene.render(envmap, transport_error.SPP, seed))
         missed = shown - display_curve.values(target.picture)
         weight = 1 if target.known_weight is None else target.known_weight

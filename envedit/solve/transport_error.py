@@ -39,5 +39,5 @@ def corrected(
 
 def path_traced(scene: Scene, envmap: np.ndarray, seed: int, keep: bool = True) -> np.ndarray:
     """Return I(E) of a map E, (h, w, 3), with :data:`SPP` samples; ``keep`` as of :func:`corrected`."""
-    picture, _, _ = rendered(scene, envmap, SPP, Seeds.of(seed).solution_check, keep)
+    picture, _, _ = rendered(scene, envmap, SPP, Seeds(seed).solution_check, keep)
     return picture

@@ -38,7 +38,7 @@ _PREFIX = "envedit."  # of a fact in the picture's metadata
 def initial(scene: Scene, envmap: np.ndarray, settings: config.Config) -> np.ndarray:
     """Render the picture to paint on, (h, w, 3): the scene under the map as it is, at [target] spp."""
     picture, _, _ = rendered(
-        scene, envmap, settings.target.spp, Seeds.of(settings.seed).exported, settings.renderer.cache
+        scene, envmap, settings.target.spp, Seeds(settings.seed).exported, settings.renderer.cache
     )
     return picture
 

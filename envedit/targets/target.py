@@ -178,7 +178,7 @@ def _of_paint(settings, scene, envmap, picture, mask, hidden):
     if chosen.kind == "image" and mask is None and not chosen.masks:
 
         def again():
-            seed, cache = Seeds.of(settings.seed).judged, settings.renderer.cache
+            seed, cache = Seeds(settings.seed).judged, settings.renderer.cache
             return rendered(scene, envmap, chosen.spp, seed, cache)[0]
 
         if rendered_anew.is_rendered_anew(painted.picture, initial, painted.coverage, again, scene.rows):
@@ -254,7 +254,7 @@ def _of_photo(settings, scene, envmap, picture, mask):
         raise ConfigError('target.kind = "photo": expected one file in target.file, and a scene of one view')
     everywhere = np.ones_like(envmap, np.float32)
     spp, cache = chosen.spp, settings.renderer.cache
-    outlines, _, _ = rendered(scene, everywhere, spp, Seeds.of(settings.seed).target_again, cache)
+    outlines, _, _ = rendered(scene, everywhere, spp, Seeds(settings.seed).target_again, cache)
     file = chosen.files[0]
     mask_file = "".join(chosen.masks)
     photo, warnings = photographs.read(file, mask_file, outlines, chosen.align, chosen.vignetting)
@@ -402,7 +402,7 @@ def with_noise(
     error (h, w) of display values, RMS over channels: where it is not known from passes, |d1 - d2| / sqrt(2),
     with d2 a second rendering with as many samples.
     """
-    seeds = Seeds.of(settings.seed)
+    seeds = Seeds(settings.seed)
     samples = settings.target.spp
     keep = settings.renderer.cache
     picture, spp, noise = rendered(scene, envmap, samples, seeds.target, keep)

@@ -246,7 +246,7 @@ def stopping(sampled):
     """Press Ctrl-C when the result is to be rendered."""
 
     def stop(self, envmap, spp, seed, *rest):
-        if seed == Seeds.of(0).judged:
+        if seed == Seeds(0).judged:
             raise KeyboardInterrupt
         return sampled(self, envmap, spp, seed, *rest)
 

@@ -337,7 +337,7 @@ def test_what_fails_after_the_loop_leaves_the_map(stage, tmp_path, rng, monkeypa
     sampled = scene.Scene.sampled
 
     def judged_fails(self, envmap, spp, seed, *rest):
-        return fails() if seed == Seeds.of(0).judged else sampled(self, envmap, spp, seed, *rest)
+        return fails() if seed == Seeds(0).judged else sampled(self, envmap, spp, seed, *rest)
 
     if stage == "adjustment":
         monkeypatch.setattr(pipeline.adjustments, "adjust", fails)

@@ -664,4 +664,4 @@ def test_the_run_renders_the_exported_picture_again(monkeypatch):
         initial_rendering, "rendered", lambda lit, envmap, *asked: ((envmap, *asked[:2]), 0, None)
     )
     found = initial_rendering.initial(None, "map", settings(spp=32))
-    assert found == ("map", 32, Seeds.of(3).exported)
+    assert found == ("map", 32, Seeds(3).exported)

@@ -33,7 +33,7 @@ def test_turned_target_is_the_rendering_of_the_turned_map(ball, rng):
     envmap = sky(rng)
     made = target.make(asking(5, rotate_degrees=40), ball, envmap)
     np.testing.assert_array_equal(made.envmap, latlong.rotate(envmap, 40).astype(np.float32))
-    expected = ball.render(made.envmap, spp=4, seed=Seeds.of(5).target)
+    expected = ball.render(made.envmap, spp=4, seed=Seeds(5).target)
     np.testing.assert_array_equal(made.picture, expected)
     assert made.picture.shape == (12, 16, 3) and made.picture.dtype == made.envmap.dtype == np.float32
     assert made.weight is None and made.warnings == () and "40 degrees" in made.source
@@ -56,7 +56,7 @@ def test_another_map_is_read_at_the_working_width(ball, tmp_path, rng):
     made = target.make(asking(1, file=str(file)), ball, sky(rng))
     expected, info = images.load_envmap(file, 16)
     np.testing.assert_array_equal(made.envmap, expected)
-    np.testing.assert_array_equal(made.picture, ball.render(expected, spp=4, seed=Seeds.of(1).target))
+    np.testing.assert_array_equal(made.picture, ball.render(expected, spp=4, seed=Seeds(1).target))
     assert str(file) in made.source
     assert made.warnings == tuple(info["warnings"]) and "negative" in made.warnings[0]
 

@@ -412,7 +412,7 @@ class Session:
         """Return one pass of Mitsuba's rendering of a map, at the size that is shown when idle."""
         if self._sharp is None:
             self._sharp = working_size.scaled(self.scene, SHARPER) or self.scene
-        return self._sharp.render(shown, PASS, Seeds.of(self.project.settings.seed).pass_of_page(i))
+        return self._sharp.render(shown, PASS, Seeds(self.project.settings.seed).pass_of_page(i))
 
     def _worked_on(self, scene):
         """Return the scene at the size that an edit is solved at; as it is, if strokes are in its pixels."""

@@ -157,11 +157,13 @@ def separate(
         return Separation(image, np.ones_like(image), np.zeros_like(image), [])
 
     # ---- Glow, cores and background at the map's own resolution
-    places = _Places(survey.rows, survey.label.shape[1], first, total)
+    row, column = _places(survey, (height, width), (first, total))
     glow = glow_of(survey, latlong.directions(total, width, slice(first, first + height)))
-    label = places.at(survey.label, height, width)
+    label = _nearest(survey.label, row, column)
     inside = (label >= 0)[..., None]
-    below = places.upsampled(survey.below, height, width)
+    below = survey.below
+    if below.shape[:2] != (height, width):
+        below = resampling.bilinear(below, row[:, None], column, around=True)
     core = np.where(inside, np.maximum(image - below * glow, 0), 0)
     background = np.where(inside, (image - core) / glow, image / glow)
 
@@ -193,16 +195,11 @@ def glow_of(survey: Survey, directions: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _Small:
-    """The copy of an image in which lights are looked for.
-
-    ``first`` and ``total`` are the image's own rows in its map, ``rows`` the same of the copy.
-    """
+    """The copy of an image in which lights are looked for; ``rows``: its first row, and those of its map."""
 
     image: np.ndarray
     directions: np.ndarray
     omega: np.ndarray
-    first: int
-    total: int
     rows: tuple[int, int]
 
     def centre(self, mask):
@@ -214,37 +211,22 @@ class _Small:
         return centre / size if size else centre
 
 
-@dataclass(frozen=True)
-class _Places:
-    """Where texels of an image lie among those of the small copy.
+def _places(survey, shape, rows):
+    """Return at which fractional rows and columns of the small copy the texels of an image lie.
 
-    ``rows``: first row and total of the copy, ``columns``: its columns; ``first``, ``total``: of the image.
+    ``shape`` is that of the image, ``rows`` its first row and those of its map.
     """
+    height, width = shape
+    start, small_total = survey.rows
+    scale = (small_total - 1) / max(rows[1] - 1, 1)
+    row = (np.arange(height) + rows[0]) * scale - start
+    return row, (np.arange(width) + 0.5) * (survey.label.shape[1] / width) - 0.5
 
-    rows: tuple[int, int]
-    columns: int
-    first: int
-    total: int
 
-    def at(self, values, height, width):
-        """Values of the nearest texels at the image's own resolution."""
-        r, c = self._places(height, width)
-        row = np.clip(np.rint(r).astype(np.int64), 0, values.shape[0] - 1)
-        return values[row][:, np.rint(c).astype(np.int64) % values.shape[1]]
-
-    def upsampled(self, values, height, width):
-        """Interpolate values at the image's own resolution."""
-        if values.shape[:2] == (height, width):
-            return values
-        r, c = self._places(height, width)
-        return resampling.bilinear(values, r[:, None], c, around=True)
-
-    def _places(self, height, width):
-        """Fractional rows and columns of the small copy at the centres of the image's texels."""
-        start, small_total = self.rows
-        scale = (small_total - 1) / max(self.total - 1, 1)
-        rows = (np.arange(height) + self.first) * scale - start
-        return rows, (np.arange(width) + 0.5) * (self.columns / width) - 0.5
+def _nearest(values, row, column):
+    """Return the values of the small copy that are nearest to fractional rows and columns."""
+    r = np.clip(np.rint(row).astype(np.int64), 0, values.shape[0] - 1)
+    return values[r][:, np.rint(column).astype(np.int64) % values.shape[1]]
 
 
 def _reduced(image, first, total):
@@ -258,9 +240,9 @@ def _reduced(image, first, total):
         stop = max(round((first + height) * h / total), start + 1)
         sums, known = _resized(image, first, total, (h, w))
         small = sums[start:stop] / np.maximum(known[start:stop], 1e-6)
-    toward = latlong.directions(h, w)[start:stop]
+    toward = latlong.directions(h, w, slice(start, stop))
     omega = np.repeat(latlong.solid_angles(h, w)[start:stop, None], w, axis=1)
-    return _Small(small, toward, omega, first, total, (start, h))
+    return _Small(small, toward, omega, (start, h))
 
 
 def _resized(image, first, total, shape):

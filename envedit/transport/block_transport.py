@@ -25,7 +25,7 @@ BLOCKS = 32
 
 @dataclass(frozen=True)
 class Overview:
-    """T between blocks and cells."""
+    """T between blocks and cells; made by :meth:`of`."""
 
     # (3, blocks, cells) float32, mean over the pixels of a block, for a radiance of 1 in all texels of a cell
     matrix: np.ndarray
@@ -34,47 +34,47 @@ class Overview:
     directions: np.ndarray  # (cells, 3), unit vectors to the cells' centres
     omega: np.ndarray  # (cells,), solid angle of each cell, as a rendering receives it
 
+    @classmethod
+    def of(
+        cls, matrix: np.ndarray, shape: tuple[int, int], grid: tuple[int, int], views: Views = ()
+    ) -> Overview:
+        """Say of which pixels and texels a matrix of :func:`summed`, with the same arguments, is."""
+        block_of, _ = _blocks(shape, views)
+        cell_of, cells = _cells(grid)
+        omega = np.repeat(latlong.lookup_solid_angles(*grid), grid[1])
+        toward = _means(latlong.directions(*grid).reshape(-1, 3), cell_of, omega)
+        toward /= np.maximum(np.linalg.norm(toward, axis=1, keepdims=True), 1e-30)
+        return cls(matrix, block_of, cell_of, toward, np.bincount(cell_of, omega, cells))
+
     def to_blocks(self, picture: np.ndarray) -> np.ndarray:
         """Average a picture (h, w, c) over blocks: (blocks, c)."""
         return _means(picture.reshape(-1, picture.shape[2]), self.block_of, np.ones(len(self.block_of)))
 
 
-def make(matrix: ColourMatrix, shape: tuple[int, int], grid: tuple[int, int], views: Views = ()) -> Overview:
-    """Sum up the entries of a transport, pixels by texels.
+def summed(
+    matrix: ColourMatrix, shape: tuple[int, int], grid: tuple[int, int], views: Views = ()
+) -> np.ndarray:
+    """Sum up the entries of a transport, pixels by texels, to :attr:`Overview.matrix`.
 
     ``shape`` and ``grid`` are height and width of the picture and of the map, ``views`` the rows of each
     view, where the picture is of several: no block is of two.
     """
     block_of, blocks = _blocks(shape, views)
-    cell_of, cells = tiles(*grid, max(1, -(-grid[1] // CELLS)))
+    cell_of, cells = _cells(grid)
     rows, columns, weights = matrix.coordinates()
     key = block_of[rows] * cells + cell_of[columns]
     count = np.bincount(block_of, minlength=blocks)
     dense = np.stack(
         [np.bincount(key, w, blocks * cells).reshape(blocks, cells) / count[:, None] for w in weights.T]
     )
-    omega = np.repeat(latlong.lookup_solid_angles(*grid), grid[1])
-    toward = _means(latlong.directions(*grid).reshape(-1, 3), cell_of, omega)
-    toward /= np.maximum(np.linalg.norm(toward, axis=1, keepdims=True), 1e-30)
-    size = np.bincount(cell_of, omega, cells)
-    return Overview(dense.astype(np.float32), block_of, cell_of, toward, size)
+    return dense.astype(np.float32)
 
 
 def whole(
     arrays: dict[str, np.ndarray], shape: tuple[int, int], grid: tuple[int, int], views: Views = ()
 ) -> bool:
-    """Return whether arrays from disk are an overview of such a picture and map: no index leaves it."""
-    block_of, blocks = _blocks(shape, views)
-    cell_of, cells = tiles(*grid, max(1, -(-grid[1] // CELLS)))
-    expected = {
-        "matrix": ("f4", (3, blocks, cells)),
-        "block_of": ("i8", block_of.shape),
-        "cell_of": ("i8", cell_of.shape),
-        "directions": ("f8", (cells, 3)),
-        "omega": ("f8", (cells,)),
-    }
-    same = holds(arrays, expected) and (arrays["block_of"] == block_of).all()
-    return bool(same and (arrays["cell_of"] == cell_of).all())
+    """Return whether arrays from disk are the matrix of such a picture and map."""
+    return holds(arrays, {"matrix": ("f4", (3, _blocks(shape, views)[1], _cells(grid)[1]))})
 
 
 def _blocks(shape, views):
@@ -88,6 +88,12 @@ def _blocks(shape, views):
         parts.append(block_of + count)
         count += blocks
     return np.concatenate(parts), count
+
+
+def _cells(grid):
+    """Return the cell of every texel, and their number."""
+    height, width = grid
+    return tiles(height, width, max(1, -(-width // CELLS)))
 
 
 def tiles(height: int, width: int, size: int) -> tuple[np.ndarray, int]:

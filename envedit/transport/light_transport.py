@@ -57,7 +57,7 @@ LEAST_LIGHT = 1 / 256
 """Light of a texel, as a share of the brightest's, below which it gets no column for a picture of its own."""
 TYPICAL_PIXELS = 128 * 128
 """Of larger pictures the error is predicted for the whole picture: errors of neighbours are independent."""
-_RECORDING = 2  # raise when the same scene, grid and seed give another recording, or other arrays of it
+_RECORDING = 3  # raise when the same scene, grid and seed give another recording, or other arrays of it
 
 
 class LightTransport:
@@ -312,9 +312,10 @@ class LightTransport:
             views = self.scene.rows
             stored = cache.load(key, lambda arrays: overviews.whole(arrays, self.shape, grid, views))
             if stored is None:
-                stored = vars(overviews.make(self.forward, self.shape, grid, views))
+                stored = {"matrix": overviews.summed(self.forward, self.shape, grid, views)}
                 cache.store(key, stored)
-            self._overview = overviews.Overview(**{k: np.array(v) for k, v in stored.items()})
+            matrix = np.array(stored["matrix"])  # a copy: it may be a mapped file
+            self._overview = overviews.Overview.of(matrix, self.shape, grid, views)
         return self._overview
 
     # ---- using ---------------------------------------------------------------------------------------------

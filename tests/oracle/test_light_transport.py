@@ -538,7 +538,7 @@ def test_overview_is_the_picture_of_cells_averaged_over_blocks(wide, rng):
 def test_overview_on_disk_has_the_same_bits(lamp_scene, tmp_path, monkeypatch):
     first = build(lamp_scene, spp=32, folder=tmp_path).overview()
     with monkeypatch.context() as patch:
-        patch.setattr(block_transport, "make", lambda *_: 1 / 0)
+        patch.setattr(block_transport, "summed", lambda *_: 1 / 0)
         again = build(lamp_scene, spp=32, folder=tmp_path).overview()
         with pytest.raises(ZeroDivisionError):  # of another recording it is not
             build(lamp_scene, spp=32, seed=1, folder=tmp_path).overview()

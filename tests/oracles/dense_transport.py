@@ -72,4 +72,6 @@ class DenseTransport:
     def overview(self):
         some, texel = np.nonzero(self.weights.any(axis=0))
         entries = some.astype(np.uint32), texel.astype(np.uint32), self.weights[:, some, texel].T
-        return block_transport.make(ColourMatrix(*entries, self.weights.shape[1:]), self.shape, self.grid)
+        matrix = ColourMatrix(*entries, self.weights.shape[1:])
+        summed = block_transport.summed(matrix, self.shape, self.grid)
+        return block_transport.Overview.of(summed, self.shape, self.grid)

@@ -32,10 +32,15 @@ def transport(rng, shape, grid):
     return matrix, full.astype(np.float64).reshape(*shape, *grid, 3)
 
 
+def overview(matrix, shape, grid, views=()):
+    summed = block_transport.summed(matrix, shape, grid, views)
+    return block_transport.Overview.of(summed, shape, grid, views)
+
+
 @pytest.mark.parametrize("shape, grid", SIZES)
 def test_the_overview_is_the_transport_averaged_tile_by_tile_over_the_sphere(shape, grid, rng):
     matrix, full = transport(rng, shape, grid)
-    result = block_transport.make(matrix, shape, grid)
+    result = overview(matrix, shape, grid)
     pixels, texels = sides(shape, grid)
     blocks, cells = list(tiles(*shape, pixels)), list(tiles(*grid, texels))
     assert result.matrix.shape == (3, len(blocks), len(cells)) and result.matrix.dtype == np.float32
@@ -59,7 +64,7 @@ def test_the_overview_is_the_transport_averaged_tile_by_tile_over_the_sphere(sha
 def test_no_more_tiles_than_stated():
     empty = np.zeros(0, np.uint32)
     matrix = ColourMatrix(empty, empty, np.zeros((0, 3), np.float32), (97 * 31, 12 * 200))
-    result = block_transport.make(matrix, (97, 31), (12, 200))
+    result = overview(matrix, (97, 31), (12, 200))
     assert result.matrix.shape == (3, 25 * 8, 3 * 50) and not result.matrix.any()
 
 
@@ -67,14 +72,14 @@ def test_no_block_is_of_two_views(rng):
     """Two views of one size have the blocks that each has alone."""
     views, grid = (slice(0, 33), slice(33, 66)), (4, 65)
     matrix, full = transport(rng, (66, 20), grid)
-    result = block_transport.make(matrix, (66, 20), grid, views)
-    assert block_transport.whole(vars(result), (66, 20), grid, views)
-    assert not block_transport.whole(vars(result), (66, 20), grid)
+    result = overview(matrix, (66, 20), grid, views)
+    assert block_transport.whole({"matrix": result.matrix}, (66, 20), grid, views)
+    assert not block_transport.whole({"matrix": result.matrix}, (66, 20), grid)
     half = np.split(result.matrix, 2, axis=1)
     for rows, one in zip(views, half, strict=True):
         part = full[rows].reshape(33 * 20, -1, 3)
         pixels, texels = np.nonzero(part.any(axis=2))
         weights = part[pixels, texels].astype(np.float32)
         indices = pixels.astype(np.uint32), texels.astype(np.uint32)
-        alone = block_transport.make(ColourMatrix(*indices, weights, part.shape[:2]), (33, 20), grid)
+        alone = overview(ColourMatrix(*indices, weights, part.shape[:2]), (33, 20), grid)
         np.testing.assert_array_equal(one, alone.matrix)

@@ -60,15 +60,11 @@ class TexelFields:
 
 
 class _Texels(NamedTuple):
-    """The texels above the horizon on the device; ``before``, ``offset`` and ``slope`` are of glows."""
+    """The texels above the horizon on the device, and the fields of no edit there."""
 
     directions: mi.Vector3f
     base: mi.Color3f
-    before: mi.Color3f | None
-    offset: mi.Color3f | None
-    slope: mi.Color3f | None
-    free: mi.Float | None
-    kept: mi.Float | None
+    fields: Fields
 
 
 @dataclass(frozen=True, eq=False)
@@ -256,25 +252,12 @@ class Layers:
 
     def _fields(self, real):
         """Return what parameters do to the rows above the horizon."""
-        glows = None
-        if self.behind is not None:
-            texels = self._texels
-            glows = Glows(
-                self.lights,
-                real["turn"],
-                real["flux"],
-                texels.before,
-                texels.offset,
-                texels.slope,
-                dr.opaque(mi.Float, self.behind.faint),
-            )
-        return Fields(
-            glows=glows,
-            log_saturation=_log_saturation(real),
-            log_gain=self.gain.evaluate(real, self._grids) if "gain.0" in real else None,
-            share=self._texels.free,
-            kept=self._texels.kept,
-        )
+        glows = self._texels.fields.glows
+        if glows is not None:
+            glows = replace(glows, turn=real["turn"], log_flux=real["flux"])
+        log_gain = self.gain.evaluate(real, self._grids) if "gain.0" in real else None
+        log_saturation = _log_saturation(real)
+        return replace(self._texels.fields, glows=glows, log_saturation=log_saturation, log_gain=log_gain)
 
     def _log_below(self, real, above, core):
         """Log factors (rows, W, 3) of the rows that follow: by lights, or None; by what else the sky does."""
@@ -307,14 +290,21 @@ class Layers:
         (first, total), (height, width) = self.rows, self.shape
         d = latlong.directions(total, width)[first : first + height].reshape(-1, 3)
         directions = dr.opaque(mi.Vector3f(np.ascontiguousarray(d.T, np.float32)))
-        before, offset, slope = None, None, None
+        glows = None
         if self.behind is not None:
-            before = dr.opaque(self.lights.glow_before(directions))
-            offset = _colours(self.behind.offset)
-            slope = _colours(self.behind.slope)
+            start = self._real(self.start())
+            glows = Glows(
+                lights=self.lights,
+                turn=start["turn"],
+                log_flux=start["flux"],
+                before=dr.opaque(self.lights.glow_before(directions)),
+                offset=_colours(self.behind.offset),
+                slope=_colours(self.behind.slope),
+                faint=dr.opaque(mi.Float, self.behind.faint),
+            )
         free = None if self.free is None else dr.opaque(mi.Float(np.float32(self.free.ravel())))
         kept = None if self.kept is None else dr.opaque(mi.Float(self.kept[:height].ravel()))
-        return _Texels(directions, _colours(self.base), before, offset, slope, free, kept)
+        return _Texels(directions, _colours(self.base), Fields(glows=glows, share=free, kept=kept))
 
     @functools.cached_property
     def _grids(self):
@@ -434,18 +424,6 @@ class Layers:
         return self.below is not None and self.below.kind == "mirror"
 
     @property
-    def followed(self) -> np.ndarray:
-        """Row of lights and gain that each row of the image goes by, (rows,)."""
-        own = np.arange(self.shape[0])
-        return own if self.below is None else np.concatenate([own, self.below.mirrored])
-
-    @property
-    def follows(self) -> np.ndarray:
-        """How far each row of the image goes by lights and gain, (rows,): 1, less where ground is kept."""
-        own = np.ones(self.shape[0])
-        return own if self.below is None else np.concatenate([own, self.below.fade])
-
-    @property
     def ground_light(self) -> GroundLight | None:
         """What falls on ground that goes by it; None where no row does."""
         return None if self.below is None else self.below.light
@@ -485,10 +463,15 @@ class Layers:
 
     def hats(self, level: int) -> list[tuple[np.ndarray, np.ndarray]]:
         """List what :meth:`.GridGain.hats` does, of all texels of the image, those that follow included."""
+        own = self.gain.hats(level, self.shape)
+        if self.below is None:
+            return own
+        followed = np.concatenate([np.arange(self.shape[0]), self.below.mirrored])
+        follows = np.concatenate([np.ones(self.shape[0]), self.below.fade])
         taps = []
-        for node, weight in self.gain.hats(level, self.shape):
-            node = node.reshape(self.shape)[self.followed]
-            weight = weight.reshape(self.shape)[self.followed] * self.follows[:, None]
+        for node, weight in own:
+            node = node.reshape(self.shape)[followed]
+            weight = weight.reshape(self.shape)[followed] * follows[:, None]
             taps.append((node.ravel(), weight.ravel()))
         return taps
 

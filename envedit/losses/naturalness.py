@@ -99,7 +99,7 @@ def cells(envmap: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     cell = row[:, None] * CELL_COLUMNS + column
     weight = np.bincount(cell.ravel(), omega.ravel())
     light = np.bincount(cell.ravel(), (omega * shown).ravel())
-    directions = latlong.directions(len(envmap), width)[:half].reshape(-1, 3)
+    directions = latlong.directions(len(envmap), width, slice(half)).reshape(-1, 3)
     centre = np.stack([np.bincount(cell.ravel(), omega.ravel() * axis) for axis in directions.T], axis=1)
     used = weight > 0
     centre = centre[used] / np.linalg.norm(centre[used], axis=1, keepdims=True)

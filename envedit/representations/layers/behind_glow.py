@@ -53,7 +53,7 @@ def degrees_to_cores(lights: list[Light], shape: tuple[int, int], rows: tuple[in
     """
     first, total = rows
     width = shape[1]
-    toward = latlong.directions(total, width)[first : first + shape[0]]
+    toward = latlong.directions(total, width, slice(first, first + shape[0]))
     omega = latlong.lookup_solid_angles(total, width)
     glowing = [light for light in lights if light.glow is not None]
     radii = [np.sqrt(omega[first + light.texels // width].sum() / np.pi) for light in glowing]

@@ -77,7 +77,7 @@ def directions(height: int, width: int, first: int = 0, total: int | None = None
     On the sphere a map has no seam, its zenith is a point, and a step of a texel is as long across as down.
     The rows are ``first`` ... ``first + height - 1`` of a map of ``total`` rows; all of them by default.
     """
-    d = latlong.directions(total or height, width)[first : first + height]
+    d = latlong.directions(total or height, width, slice(first, first + height))
     return tensor((SPHERE_SCALE * d).reshape(-1, 3))
 
 

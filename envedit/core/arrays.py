@@ -32,6 +32,12 @@ def flat(kind: type[DrArray], values: ArrayLike) -> DrArray:
     return array
 
 
+def vectors(kind: type[DrArray], values: ArrayLike) -> DrArray:
+    """Copy numbers (..., 3) to vectors or colours of a Dr.Jit type, such as ``mi.Color3f``."""
+    values = np.asarray(values)
+    return dr.opaque(kind(np.ascontiguousarray(values.reshape(-1, values.shape[-1]).T, np.float32)))
+
+
 def settled(x: DrArray, value: float) -> DrArray:
     """Return ``x``, exactly ``value`` where it is that but for :data:`ROUNDING`; its derivative stays."""
     short = value - dr.detach(x)

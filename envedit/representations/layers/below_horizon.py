@@ -29,7 +29,7 @@ import mitsuba as mi
 import numpy as np
 
 from envedit.core import latlong
-from envedit.core.arrays import settled, tensor
+from envedit.core.arrays import settled, tensor, vectors
 from envedit.core.color import LUMINANCE
 from envedit.representations.layers.gain import VEIL
 from envedit.representations.layers.ground_light import GroundLight, with_luminance
@@ -125,7 +125,7 @@ class Below:
         self.kind = kind
         self.shape = radiance.shape[:2]
         self.image = radiance
-        self.radiance = dr.opaque(mi.Color3f(np.ascontiguousarray(radiance.reshape(-1, 3).T, np.float32)))
+        self.radiance = vectors(mi.Color3f, radiance)
         self._faint = float(max(1e-6 * sky.mean(), 1e-30))
 
         # ---- How far each row follows the mirrored sky, sharp and blurred

@@ -20,7 +20,7 @@ import mitsuba as mi
 import numpy as np
 
 from envedit.core import latlong
-from envedit.core.arrays import tensor
+from envedit.core.arrays import tensor, vectors
 from envedit.core.color import LUMINANCE
 from envedit.core.radiance import BRIGHTEST, require_radiance
 from envedit.core.rotations import rotated
@@ -288,8 +288,7 @@ class Layers:
     @functools.cached_property
     def _texels(self) -> _Texels:
         (first, total), (height, width) = self.rows, self.shape
-        d = latlong.directions(total, width)[first : first + height].reshape(-1, 3)
-        directions = dr.opaque(mi.Vector3f(np.ascontiguousarray(d.T, np.float32)))
+        directions = vectors(mi.Vector3f, latlong.directions(total, width, slice(first, first + height)))
         glows = None
         if self.behind is not None:
             start = self._real(self.start())
@@ -298,13 +297,13 @@ class Layers:
                 turn=start["turn"],
                 log_flux=start["flux"],
                 before=dr.opaque(self.lights.glow_before(directions)),
-                offset=_colours(self.behind.offset),
-                slope=_colours(self.behind.slope),
+                offset=vectors(mi.Color3f, self.behind.offset),
+                slope=vectors(mi.Color3f, self.behind.slope),
                 faint=dr.opaque(mi.Float, self.behind.faint),
             )
         free = None if self.free is None else dr.opaque(mi.Float(np.float32(self.free.ravel())))
         kept = None if self.kept is None else dr.opaque(mi.Float(self.kept[:height].ravel()))
-        return _Texels(directions, _colours(self.base), Fields(glows=glows, share=free, kept=kept))
+        return _Texels(directions, vectors(mi.Color3f, self.base), Fields(glows=glows, share=free, kept=kept))
 
     @functools.cached_property
     def _grids(self):
@@ -474,11 +473,6 @@ class Layers:
             weight = weight.reshape(self.shape)[followed] * follows[:, None]
             taps.append((node.ravel(), weight.ravel()))
         return taps
-
-
-def _colours(image):
-    """Copy an image (rows, W, 3) to the device."""
-    return dr.opaque(mi.Color3f(np.ascontiguousarray(image.reshape(-1, 3).T, np.float32)))
 
 
 def _log_saturation(real):

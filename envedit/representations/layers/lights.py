@@ -22,7 +22,7 @@ import mitsuba as mi
 import numpy as np
 
 from envedit.core import latlong
-from envedit.core.arrays import tensor
+from envedit.core.arrays import tensor, vectors
 from envedit.core.color import LUMINANCE
 from envedit.core.types import ArrayLike
 from envedit.representations.layers.aureoles import CLEAR_FLUX, Aureole, Sky, clear_glow
@@ -133,10 +133,10 @@ class Lights:
         # ---- The same on the device
         self.centres = np.array([light.direction for light in lights] + [[0.0, 1.0, 0.0]] * SPARE)
         self.flux = np.concatenate([own, np.repeat(spare[None], SPARE, axis=0)])
-        self._point = dr.opaque(mi.Vector3f(np.concatenate(directions).T.astype(np.float32)))
-        self._flux = dr.opaque(mi.Color3f(np.concatenate(fluxes).T.astype(np.float32)))
+        self._point = vectors(mi.Vector3f, np.concatenate(directions))
+        self._flux = vectors(mi.Color3f, np.concatenate(fluxes))
         self._sine = dr.opaque(mi.Float(np.concatenate(sines).astype(np.float32)))
-        self._centre = dr.opaque(mi.Vector3f(self.centres.T.astype(np.float32)))
+        self._centre = vectors(mi.Vector3f, self.centres)
 
         # ---- Glows
         of_spare = aureoles if isinstance(aureoles, np.ndarray) else None

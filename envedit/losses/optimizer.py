@@ -39,7 +39,8 @@ class Adam:
     refused as a whole. What a step leads to is seen in the next one only: `take_back` returns to the
     parameters before it.
 
-    ``params``, tensors or arrays, are starting values, which are copied: read them as ``adam.params[name]``.
+    ``params``, tensors of one precision, are starting values, which are copied: read them as
+    ``adam.params[name]``.
     ``lr`` is that of a `step` that is not given its own, ``betas`` are the decay of the two moments, in
     [0, 1), and ``eps`` is above 0, so that 0 / 0 cannot arise.
     """
@@ -59,8 +60,9 @@ class Adam:
         # wrapped around numpy's memory is not aligned, which is part of a kernel too and costs a compilation.
         self.params = {name: dr.opaque(dr.detach(value)) for name, value in params.items()}
         self._before = dict(self.params)
-        self._m = {name: dr.opaque(type(value), 0, value.shape) for name, value in self.params.items()}
-        self._v = {name: dr.opaque(type(value), 0, value.shape) for name, value in self.params.items()}
+        self._kind = type(next(iter(self.params.values())))
+        self._m = {name: dr.opaque(self._kind, 0, value.shape) for name, value in self.params.items()}
+        self._v = {name: dr.opaque(self._kind, 0, value.shape) for name, value in self.params.items()}
 
     def leaves(self) -> Params:
         """Return the parameters as a new dict of leaves with gradients enabled."""
@@ -75,24 +77,23 @@ class Adam:
         too large to square, or the step leads to parameters or moments that are not finite.
         """
         lr = self.lr if lr is None else lr
-        (b1, b2) = self.betas
+        b1, b2 = self.betas
         t = self.t + 1
-        scalars = {}  # one pair per precision, in memory: kernels do not depend on the step then
+        flat = dr.array_t(self._kind)
+        index = dr.uint32_array_t(flat)
+        # In memory: kernels do not depend on the step then.
+        rate = dr.opaque(flat, lr / (1 - b1**t))
+        root = dr.opaque(flat, math.sqrt(1 - b2**t))
         new = {}
         refused = []
         for name, p in self.params.items():
-            flat = dr.array_t(type(p))
-            g = _flat(dr.detach(grads[name]))
-            if flat not in scalars:
-                scalars[flat] = (dr.opaque(flat, lr / (1 - b1**t)), dr.opaque(flat, math.sqrt(1 - b2**t)))
-            rate, root = scalars[flat]
-            m = b1 * _flat(self._m[name]) + (1 - b1) * g
-            v = b2 * _flat(self._v[name]) + (1 - b2) * dr.square(g)
+            g = dr.detach(grads[name]).array
+            m = b1 * self._m[name].array + (1 - b1) * g
+            v = b2 * self._v[name].array + (1 - b2) * dr.square(g)
             update = rate * m / (dr.sqrt(v) / root + self.eps)
-            new[name] = _flat(p) - update, m, v
+            new[name] = p.array - update, m, v
             # v takes up the gradient's square; an infinite one gives finite steps, of zero, for good.
             good = dr.isfinite(v) & dr.isfinite(new[name][0])
-            index = dr.uint32_array_t(flat)
             # A flag each: a second scatter to the same one would force an evaluation in between.
             flag = dr.opaque(index, 0)
             dr.scatter(flag, index(1), index(0), ~good)
@@ -104,8 +105,10 @@ class Adam:
             return False
         self._before = dict(self.params)
         for name, (p, m, v) in new.items():
-            shape, kind = self.params[name].shape, type(self.params[name])
-            self.params[name], self._m[name], self._v[name] = (_shaped(kind, a, shape) for a in (p, m, v))
+            shape = self.params[name].shape
+            self.params[name] = self._kind(p, shape)
+            self._m[name] = self._kind(m, shape)
+            self._v[name] = self._kind(v, shape)
         self.t = t
         return True
 
@@ -138,19 +141,10 @@ class Adam:
             if got != shape:
                 raise InputError(f"optimiser state: {key} has shape {got}, expected {shape}.")
         for name, value in self.params.items():
-            kind, shape = type(value), value.shape
             for part, target in self._parts():
-                flat = dr.array_t(kind)(np.ascontiguousarray(entries[f"{part}/{name}"]).ravel())
-                target[name] = dr.opaque(_shaped(kind, flat, shape))
+                flat = dr.array_t(self._kind)(np.ascontiguousarray(entries[f"{part}/{name}"]).ravel())
+                target[name] = dr.opaque(self._kind(flat, value.shape))
         self.t = int(entries["step"])
-
-
-def _flat(value):
-    return value.array if dr.is_tensor_v(value) else value
-
-
-def _shaped(kind, flat, shape):
-    return kind(flat, shape) if dr.is_tensor_v(kind) else kind(flat)
 
 
 # ---- Schedules: functions of the step, counted from 0 ------------------------------------------------------

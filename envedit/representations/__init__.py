@@ -1,6 +1,7 @@
 """What the optimiser's parameters are: representations of the part of a map that is edited."""
 
-from envedit.representations.base import EPSILON, Params, Representation
+from envedit.core.types import Params
+from envedit.representations.base import EPSILON, Representation
 from envedit.representations.choice import encoded, make
 from envedit.representations.layers.layers import Layers
 from envedit.representations.pixels import LogPixels, Pixels

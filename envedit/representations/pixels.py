@@ -8,7 +8,8 @@ import numpy as np
 
 from envedit.core.arrays import tensor
 from envedit.core.radiance import BRIGHTEST, require_radiance
-from envedit.representations.base import EPSILON, Params, not_negative
+from envedit.core.types import Params
+from envedit.representations.base import EPSILON, not_negative
 
 
 class Pixels:

@@ -60,7 +60,7 @@ def differ(a, b, tolerance=1e-4):
 def test_forward_is_the_published_network(hidden, depth, count, rng):
     params, x = siren.init(3, hidden, depth), points(rng, count)
     y, _ = siren.forward(params, x, OMEGA)
-    assert y.shape == (count, 3) and siren.layers(params) == depth + 2
+    assert y.shape == (count, 3) and len(params) == 2 * (depth + 2)
     expected = numpy_forward(arrays(params), x.numpy(), OMEGA)
     # One rounding of a phase, 6e-8, is multiplied by omega |W| in every layer.
     np.testing.assert_allclose(y.numpy(), expected, atol=2e-5)
@@ -137,9 +137,9 @@ def test_gradient_flows_on_in_a_larger_graph(rng):
 
 def test_initial_weights_are_uniform_within_the_published_bounds():
     hidden, omega = 64, 25.0
-    params = arrays(siren.init(11, hidden, 3, omega, inputs=4, outputs=5))
-    assert [params[f"{i}.weight"].shape for i in range(5)] == [(64, 4), *[(64, 64)] * 3, (5, 64)]
-    assert [params[f"{i}.bias"].shape for i in range(5)] == [(64,)] * 4 + [(5,)]
+    params = arrays(siren.init(11, hidden, 3, omega, inputs=4))
+    assert [params[f"{i}.weight"].shape for i in range(5)] == [(64, 4), *[(64, 64)] * 3, (3, 64)]
+    assert [params[f"{i}.bias"].shape for i in range(5)] == [(64,)] * 4 + [(3,)]
     for i in range(5):
         fan_in = 4 if i == 0 else hidden
         bounds = {"weight": 1 / 4 if i == 0 else np.sqrt(6 / hidden) / omega, "bias": fan_in**-0.5}

@@ -24,6 +24,7 @@ from envedit import config
 from envedit.core.array_cache import DiskCache, holds
 from envedit.core.arrays import tensor
 from envedit.core.errors import InputError, NumericalError, place_of
+from envedit.core.types import Params
 from envedit.losses import losses, metrics, optimizer, ssim
 from envedit.representations.base import EPSILON, not_negative
 from envedit.representations.siren import network as siren
@@ -158,7 +159,7 @@ def points(
 
 
 def evaluate(
-    params: siren.Params, normalisation: Normalisation, x: mi.TensorXf, shape: tuple[int, int], omega: float
+    params: Params, normalisation: Normalisation, x: mi.TensorXf, shape: tuple[int, int], omega: float
 ) -> mi.TensorXf:
     """Evaluate a network at :func:`points` as linear radiance (H, W, 3), differentiable in its weights."""
     y = siren.evaluate(params, x, omega)
@@ -205,20 +206,20 @@ class Perturbation:
     kloofendal_48d at 128x32 ended at 34.8 instead of 40.1 dB and was less robust.
     """
 
-    def __init__(self, params: siren.Params, gamma: float):
+    def __init__(self, params: Params, gamma: float):
         self.gamma = gamma
         self.names = [name for name in params if name.endswith(".weight")]
         self._zeros = {name: dr.opaque(dr.zeros(mi.TensorXf, params[name].shape)) for name in self.names}
-        self._direction: siren.Params | None = None
+        self._direction: Params | None = None
 
-    def update(self, grads: siren.Params, lr: float) -> None:
+    def update(self, grads: Params, lr: float) -> None:
         """Set the direction of ascent from a gradient of the loss that is to be made worse."""
         proxy = optimizer.Adam(self._zeros, lr)
         # A refused (non-finite) gradient leaves the direction at zero: no perturbation in this epoch.
         proxy.step({name: -grads[name] for name in self.names})
         self._direction = proxy.params
 
-    def apply(self, params: siren.Params) -> siren.Params:
+    def apply(self, params: Params) -> Params:
         """Return perturbed parameters; a layer without direction or of zero norm stays as it is."""
         out = dict(params)
         for name in self.names:

@@ -23,27 +23,24 @@ import numpy as np
 
 from envedit.core import latlong
 from envedit.core.arrays import tensor
-
-Params = dict[str, "mi.TensorXf"]
+from envedit.core.types import Params
 
 SPHERE_SCALE = 1.5
 """Radius of the sphere on which directions lie: the higher, the finer the detail that is found first."""
 
 
-def init(
-    seed: int, hidden: int = 256, depth: int = 6, omega: float = 30.0, inputs: int = 2, outputs: int = 3
-) -> Params:
+def init(seed: int, hidden: int = 256, depth: int = 6, omega: float = 30.0, inputs: int = 2) -> Params:
     """Draw the initial weights of a SIREN.
 
     First layer U(-1/in, 1/in), later ones U(-sqrt(6/in)/omega, sqrt(6/in)/omega) (Sitzmann et al. 2020,
     Sec. 3.2), biases U(-1/sqrt(in), 1/sqrt(in)) as in the authors' code.
 
     ``hidden`` is the width, ``depth`` the number of hidden sine layers after the first, ``omega`` the angular
-    frequency of the sine layers, and ``inputs`` and ``outputs`` are the sizes of a coordinate and of a value.
-    The same seed gives the same weights on every machine.
+    frequency of the sine layers, and ``inputs`` the size of a coordinate; a value is a colour. The same seed
+    gives the same weights on every machine.
     """
     rng = np.random.default_rng(seed)
-    sizes = [inputs] + [hidden] * (depth + 1) + [outputs]
+    sizes = [inputs] + [hidden] * (depth + 1) + [3]
     params: Params = {}
     for i, (fan_in, fan_out) in enumerate(zip(sizes[:-1], sizes[1:], strict=True)):
         bound = 1.0 / fan_in if i == 0 else np.sqrt(6.0 / fan_in) / omega
@@ -52,11 +49,6 @@ def init(
         params[f"{i}.weight"] = tensor(weight)
         params[f"{i}.bias"] = tensor(rng.uniform(-bias, bias, fan_out))
     return params
-
-
-def layers(params: Params) -> int:
-    """Count the layers of a parameter dict, the linear one included."""
-    return len(params) // 2
 
 
 def coordinates(height: int, width: int) -> mi.TensorXf:
@@ -84,10 +76,10 @@ def directions(height: int, width: int, first: int = 0, total: int | None = None
 def forward(params: Params, x: mi.TensorXf, omega: float) -> tuple[mi.TensorXf, list]:
     """Evaluate the network at coordinates ``x`` (N, inputs).
 
-    Returns values (N, outputs) in (0, 1), and a tape: per layer its input and omega * cos, and the output,
+    Returns values (N, 3) in (0, 1), and a tape: per layer its input and omega * cos, and the output,
     which is what :func:`backward` needs.
     """
-    last = layers(params) - 1
+    last = len(params) // 2 - 1
     tape = []
     h = x
     for i in range(last):
@@ -103,11 +95,11 @@ def forward(params: Params, x: mi.TensorXf, omega: float) -> tuple[mi.TensorXf, 
 
 
 def backward(params: Params, tape: list, grad: mi.TensorXf) -> Params:
-    """Pull ``grad`` (N, outputs), of a scalar by y, back to the parameters that made the ``tape``.
+    """Pull ``grad`` (N, 3), of a scalar by y, back to the parameters that made the ``tape``.
 
     Returns the gradient of every parameter, same names and shapes.
     """
-    last = layers(params) - 1
+    last = len(params) // 2 - 1
     grads: Params = {}
     h, y = tape[last]
     delta = grad * y * (1 - y)

@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from envedit.core.arrays import tensor
+from envedit.core.types import Params
 from envedit.representations.siren import network as siren
 
 RIDGE = 5e-6
@@ -19,8 +20,8 @@ NEWTON_STEPS = 2
 
 
 def last_layer(
-    params: siren.Params, x: mi.TensorXf, omega: float, target: np.ndarray, light: np.ndarray, share: float
-) -> siren.Params:
+    params: Params, x: mi.TensorXf, omega: float, target: np.ndarray, light: np.ndarray, share: float
+) -> Params:
     """Solve for the last layer that reproduces ``target`` best.
 
     Gauss-Newton on sum_i w_i (sigmoid(W h_i + b) - y_i)^2 + ridge |step|^2, channel by channel, in float64.
@@ -28,11 +29,11 @@ def last_layer(
     hold, so that the sum of light comes out right.
 
     ``params`` are of a fitted network (:mod:`.network`) of angular frequency ``omega``, ``x`` (N, inputs) its
-    points, ``target`` (N, outputs) is in [0, 1], and ``light`` (N, outputs) is E, at least 0. Returns the
+    points, ``target`` (N, 3) is in [0, 1], and ``light`` (N, 3) is E, at least 0. Returns the
     parameters with another last layer; a channel whose solution is not finite or worse stays.
     """
     # ---- Features, their weights, and the layer as it is
-    last = siren.layers(params) - 1
+    last = len(params) // 2 - 1
     _, tape = siren.forward(params, x, omega)
     features = tape[-1][0].numpy().astype(np.float64)
     features = np.concatenate([features, np.ones((len(features), 1))], axis=1)

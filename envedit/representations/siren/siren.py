@@ -11,7 +11,7 @@ import numpy as np
 from envedit import config
 from envedit.core.arrays import tensor
 from envedit.core.radiance import BRIGHTEST, require_radiance
-from envedit.representations.base import Params
+from envedit.core.types import Params
 from envedit.representations.siren import fit
 
 
@@ -43,7 +43,7 @@ class Siren:
         self.factor = np.ones(3)
         self._rows = rows
         self._shape: tuple[int, int] | None = None
-        self._points: dict[tuple[int, int], mi.TensorXf] = {}
+        self._points: mi.TensorXf | None = None
 
     def encode(self, image: np.ndarray, seed: int = 0) -> Params:
         """Fit the network, or take an earlier fit of the same image from disk."""
@@ -52,19 +52,11 @@ class Siren:
             image, self.network, self.settings, seed, self._rows, folder=self.folder, progress=self.progress
         )
         self._shape = image.shape[:2]
-        self._points = {}
+        self._points = fit.points(self.network, self._shape, self._rows)
         return {name: tensor(value) for name, value in self.fitted.params.items()}
 
-    def decode(self, params: Params, shape: tuple[int, int] | None = None) -> mi.TensorXf:
-        """Evaluate the network at the resolution of the image, or at any other ``shape``."""
-        height, width = shape or self._shape
-        shape = height, width
-        if shape not in self._points:
-            first, total = self._rows or (0, self._shape[0])
-            finer = shape[0] / self._shape[0]
-            above, below = (round(n * finer) for n in (first, total - first - self._shape[0]))
-            rows = above, above + shape[0] + below
-            self._points[shape] = fit.points(self.network, shape, rows)
+    def decode(self, params: Params) -> mi.TensorXf:
+        """Evaluate the network at the resolution of the image."""
         normalisation = self.fitted.normalisation
-        radiance = fit.evaluate(params, normalisation, self._points[shape], shape, self.network.omega)
+        radiance = fit.evaluate(params, normalisation, self._points, self._shape, self.network.omega)
         return radiance * tensor(self.factor[None, None])

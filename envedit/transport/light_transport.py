@@ -200,17 +200,14 @@ class LightTransport:
         transport._stored = cache, key | {"part": "overview"}
         recording = cache.load(key, transport._whole)
         if recording is None:
-            transport._trace(plan.lamps, progress)
+            offset = other_light(scene, plan.lamps, seed)
+            offset = np.zeros(1, np.float32) if offset is None else offset.ravel()
+            transport._offset = dr.opaque(mi.Float(offset))
+            transport._record(progress)
             cache.store(key, transport._recording())
         else:
             transport._take(recording)
         return transport
-
-    def _trace(self, lamps, progress=None):
-        """Trace the first recording, and the light of other lamps up to a path depth."""
-        offset = other_light(self.scene, lamps, self._base_seed)
-        self._offset = dr.opaque(mi.Float, 0) if offset is None else dr.opaque(mi.Float(offset.ravel()))
-        self._record(progress)
 
     def _record(self, progress=None):
         """Trace the coarse tier with the seed of the present epoch."""

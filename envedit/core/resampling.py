@@ -1,4 +1,4 @@
-"""Pictures at another size, in linear radiance."""
+"""Pictures at another size, in linear radiance, and a smooth step."""
 
 from __future__ import annotations
 
@@ -51,3 +51,9 @@ def bilinear(image: np.ndarray, row: np.ndarray, column: np.ndarray, around: boo
     upper = (1 - right) * image[top, left] + right * image[top, beside]
     lower = (1 - right) * image[bottom, left] + right * image[bottom, beside]
     return (1 - down) * upper + down * lower
+
+
+def smooth_step(x: np.ndarray) -> np.ndarray:
+    """Return 0 up to 0, 1 from 1 on, and 3 x^2 - 2 x^3 between."""
+    x = np.clip(x, 0, 1)
+    return x * x * (3 - 2 * x)

@@ -11,6 +11,7 @@ import numpy as np
 
 from envedit.core import latlong
 from envedit.core.arrays import flat
+from envedit.core.resampling import smooth_step
 from envedit.export.texel_maps import Band, Places
 
 MODERATE = 4.0
@@ -49,7 +50,7 @@ class Ratio:
         self.m = np.minimum(ratio, MODERATE)
         darker = _most_around(-np.log2(np.maximum(ratio.min(axis=2), 1e-30)))
         brighter = _most_around(np.log2(np.maximum(ratio.max(axis=2), 1e-30)))
-        replaced, added = _step(darker - 1), _step(brighter - 1)
+        replaced, added = smooth_step(darker - 1), smooth_step(brighter - 1)
         self.parts = np.stack([replaced, added * (1 - replaced)], axis=2)
         self.replacement = _Linear(np.where(self.changed[..., None], self.want, self.old))
         self.more = _Linear(np.where(self.changed[..., None], self.want - self.old, 0))
@@ -142,12 +143,6 @@ def _most_around(values):
     padded = np.pad(values, ((1, 1), (0, 0)), mode="edge")
     down = np.maximum(np.maximum(padded[:-2], padded[1:-1]), padded[2:])
     return np.maximum(np.maximum(np.roll(down, 1, axis=1), down), np.roll(down, -1, axis=1))
-
-
-def _step(x):
-    """0 up to 0, 1 from 1 on, smooth between."""
-    x = np.clip(x, 0, 1)
-    return x * x * (3 - 2 * x)
 
 
 class _Linear:

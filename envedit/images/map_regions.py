@@ -21,6 +21,7 @@ import numpy as np
 from envedit.core import latlong
 from envedit.core.errors import ConfigError
 from envedit.core.radiance import BRIGHTEST, require_radiance
+from envedit.core.resampling import smooth_step
 from envedit.images import inpainting
 
 ROWS = 128
@@ -91,8 +92,7 @@ def _weight(region: Region, height: int, width: int) -> np.ndarray:
             inwards = _within_brush(region["points"], region["radius"], fade, (height, width), band)
         else:
             inwards = _within_polygon(region["polygon"], (height, width), band)
-        t = np.clip(1 + inwards / fade, 0, 1)
-        weight[band] = t * t * (3 - 2 * t)
+        weight[band] = smooth_step(1 + inwards / fade)
     return weight
 
 

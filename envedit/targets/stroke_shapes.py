@@ -9,6 +9,8 @@ import math
 
 import numpy as np
 
+from envedit.core.resampling import smooth_step
+
 _SUBSAMPLES = 8  # along a side of a pixel that an edge crosses
 _LEAST = 1e-6  # less coverage is none
 
@@ -36,7 +38,7 @@ def coverage(stroke: dict, height: int, width: int) -> np.ndarray:
     y, x = np.mgrid[y0:y1, x0:x1] + 0.5
     centres = np.stack([x.ravel(), y.ravel()], axis=-1)
     d = distance(centres)
-    nearby = _smooth_step(0.5 - d / max(soft, 1.0))
+    nearby = smooth_step(0.5 - d / max(soft, 1.0))
     if soft < 8:
         crossed = np.flatnonzero(np.abs(d) < soft / 2 + 0.75)  # a pixel reaches 0.71 from its centre
         offsets = (np.arange(_SUBSAMPLES) + 0.5) / _SUBSAMPLES - 0.5
@@ -44,15 +46,10 @@ def coverage(stroke: dict, height: int, width: int) -> np.ndarray:
         for start in range(0, len(crossed), 1 << 14):
             part = crossed[start : start + (1 << 14)]
             d = distance((centres[part, None] + places).reshape(-1, 2)).reshape(len(part), -1)
-            nearby[part] = _smooth_step(0.5 - d / max(soft, 1 / _SUBSAMPLES)).mean(axis=1)
+            nearby[part] = smooth_step(0.5 - d / max(soft, 1 / _SUBSAMPLES)).mean(axis=1)
     nearby[nearby < _LEAST] = 0
     covered[y0:y1, x0:x1] = nearby.reshape(y1 - y0, x1 - x0)
     return covered[..., None]
-
-
-def _smooth_step(u):
-    u = np.clip(u, 0, 1)
-    return u * u * (3 - 2 * u)
 
 
 def _shape(stroke, scale, across):

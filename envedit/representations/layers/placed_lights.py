@@ -16,6 +16,7 @@ from envedit.core import latlong
 from envedit.core.arrays import tensor
 from envedit.core.color import LUMINANCE
 from envedit.core.radiance import BRIGHTEST, require_radiance
+from envedit.core.resampling import smooth_step
 from envedit.core.rotations import rotation_vector
 from envedit.images import map_regions
 from envedit.representations.layers import below_horizon, light_images
@@ -214,8 +215,7 @@ def profile(light: dict, toward: np.ndarray, texel: float) -> np.ndarray:
     middle = b / 4 if shape == "ring" else min(a, b)
 
     def inside(distance):
-        t = np.clip(0.5 + distance / max(2 * light.get("softness", 0) * middle, texel), 0, 1)
-        return t * t * (3 - 2 * t)
+        return smooth_step(0.5 + distance / max(2 * light.get("softness", 0) * middle, texel))
 
     if shape in ("disc", "ring"):
         radius = np.hypot(x / a, y / b)

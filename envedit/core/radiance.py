@@ -54,15 +54,8 @@ def repair(image: ArrayLike) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     becomes the mean of its eight neighbours, columns periodic, as its other channels are no more to be
     trusted; holes are filled from their rim inwards.
 
-    Returns
-    -------
-    image : array (H, W, 3) float32
-        The same where it was finite.
-    overflowed : array of bool (H, W)
-        Texels that were infinite.
-    replaced : array of bool (H, W)
-        Texels that were replaced by their neighbours.
-    InputError if no texel is finite.
+    Returns the image (H, W, 3) float32, the same where it was finite; and bool (H, W), which texels were
+    infinite, and which were replaced by their neighbours. InputError if no texel is finite.
     """
     # ---- Infinities: the brightest of the image
     with np.errstate(over="ignore"):

@@ -96,22 +96,13 @@ def compare(
 ) -> dict:
     """Compare two images of linear radiance under a tonemap, ``clip(E, 0, 1)^(1/2.2)`` by default.
 
-    Parameters
-    ----------
-    lpips : distances.Lpips, optional
-        What measures LPIPS of the display values.
-    seen : array of bool (H, W), optional
-        Pixels over which ``mse`` and ``psnr`` are taken; all by default, or where none is.
-    views : sequence of slice
-        Rows of each view, where the images are of several: ``ssim`` and ``lpips`` are means over views,
-        weighted by their pixels.
+    ``lpips`` measures LPIPS of the display values. ``mse`` and ``psnr`` are taken over the pixels ``seen``,
+    bool (H, W); all by default, or where none is. ``views`` are the rows of each view, where the images are
+    of several: ``ssim`` and ``lpips`` are means over views, weighted by their pixels.
 
-    Returns
-    -------
-    dict
-        ``psnr`` (dB), ``ssim``, ``mse`` for a data range of 1; ``lpips``, None without one, or of images that
-        are too small for it; ``log_rmse``; and ``beyond_display``, the share of the samples that differ of
-        which a display shows nothing: both black, or both white.
+    Returns ``psnr`` (dB), ``ssim``, ``mse`` for a data range of 1; ``lpips``, None without one, or of images
+    that are too small for it; ``log_rmse``; and ``beyond_display``, the share of the samples that differ of
+    which a display shows nothing: both black, or both white.
     """
     radiance = _pair(a, b)
     a, b = (apply_tonemap(image, tonemap) for image in radiance)
@@ -204,13 +195,10 @@ def painted(
     error of the result's display values under "gamma"; that of the initial rendering, which is in the target
     as well, is taken to be the same.
 
-    Returns
-    -------
-    dict
-        ``towards``: 1 - sum c |edited - target| / sum c |initial - target|, None where nothing was asked, or
-        less than noise leaves of it where it is followed exactly: the mean of |x - y| is 2 / sqrt(pi) times
-        the noise of each;
-        ``elsewhere``: mean of |edited - initial| weighted by 1 - c, None where all was painted.
+    Returns ``towards``: 1 - sum c |edited - target| / sum c |initial - target|, None where nothing was asked,
+    or less than noise leaves of it where it is followed exactly: the mean of |x - y| is 2 / sqrt(pi) times
+    the noise of each; and ``elsewhere``: mean of |edited - initial| weighted by 1 - c, None where all was
+    painted.
     """
     edited, target = _pair(edited, target)
     _, initial = _pair(edited, initial)

@@ -26,17 +26,10 @@ def not_negative(radiance: mi.TensorXf) -> mi.TensorXf:
 class Representation(Protocol):
     """The part of a map that is edited, as parameters.
 
-    Attributes
-    ----------
-    lr : float
-        Learning rate that suits the parameters.
-    models_edit : bool
-        The parameters describe the edit and not the map: they start at "no change", are searched for before
-        they are optimised, and apply to the original at any resolution.
-    fitted : Fitted or None
-        How well the map was fitted, where it is.
-    separation : Separation or None
-        Lights and background of the map, where they are separated.
+    ``lr`` is the learning rate that suits them. With ``models_edit`` they describe the edit and not the map:
+    they start at "no change", are searched for before they are optimised, and apply to the original at any
+    resolution. ``fitted`` says how well the map was fitted, ``separation`` are its lights and background;
+    None where it is not fitted, or they are not separated.
     """
 
     @property
@@ -61,8 +54,6 @@ class Encoder(Representation, Protocol):
     def encode(self, image: np.ndarray, seed: int = 0) -> Params:
         """Return the parameters that reproduce an image (H, W, 3) as well as the representation can.
 
-        Raises
-        ------
-        InputError
-            If the image is not radiance, or holds what :meth:`.Representation.decode` could not give back.
+        InputError if the image is not radiance, or holds what :meth:`.Representation.decode` could not give
+        back.
         """

@@ -104,31 +104,17 @@ class Layers:
         fixed: np.ndarray | None = None,
         kept: np.ndarray | None = None,
     ) -> Layers:
-        """Separate an image.
+        """Separate an image (rows, W, 3) of linear radiance.
 
-        Parameters
-        ----------
-        image : ndarray (rows, W, 3)
-            Linear radiance.
-        rows : (int, int), optional
-            First row of the image in its map, and the rows of that map; None: it is a whole map.
-        cycles : int
-            Cycles of the gain around the horizon, before :meth:`refined`.
-        horizon : str
-            What rows below the horizon do where the image is a whole map: "mirror" or "keep", as of
-            ``below_horizon.py``, or "free": edited as those above.
-        aureoles : bool or ndarray
-            Lights that are added have the glow of the map's strongest, or of a sun in a clear sky, or that of
-            a table, as for :class:`.Lights`.
-        fixed : ndarray (rows, W, 3), optional
-            What of the image is of locked lights: it is left out of the separation, and never changes.
-        kept : ndarray (rows, W), optional
-            How far a texel stays as it is, 0 to 1: that share of the original is in every decoded map.
+        ``rows`` are its first row in its map, and the rows of that map; None: it is a whole map. ``cycles``
+        are those of the gain around the horizon, before :meth:`refined`. ``horizon`` is what rows below the
+        horizon of a whole map do: "mirror" or "keep", as of ``below_horizon.py``, or "free": edited as those
+        above. With ``aureoles`` lights that are added have a glow, as for :class:`.Lights`: of the map's
+        strongest, or of a sun in a clear sky, or of a table. ``fixed`` (rows, W, 3) is what of the image is
+        of locked lights: it is left out of the separation, and never changes. ``kept`` (rows, W) is how far a
+        texel stays as it is, 0 to 1: that share of the original is in every decoded map.
 
-        Raises
-        ------
-        InputError
-            If a texel is not finite, negative, or brighter than :data:`.radiance.BRIGHTEST`.
+        InputError if a texel is not finite, negative, or brighter than :data:`.radiance.BRIGHTEST`.
         """
         rows = rows or (0, len(image))
         require_radiance(image, "layers", rows[0], BRIGHTEST)

@@ -227,10 +227,10 @@ class KnownGradient(dr.CustomOp):
         return "measure"
 
 
-def _gaussian(length, sigma=1.5):
-    """Gaussian window of the largest odd size up to :data:`WINDOW` that fits, with sum one."""
+def _gaussian(length):
+    """Gaussian window, sigma 1.5, of the largest odd size up to :data:`WINDOW` that fits, with sum one."""
     radius = (min(WINDOW, length) - 1) // 2
-    taps = [math.exp(-0.5 * (i / sigma) ** 2) for i in range(-radius, radius + 1)]
+    taps = [math.exp(-0.5 * (i / 1.5) ** 2) for i in range(-radius, radius + 1)]
     return [tap / sum(taps) for tap in taps]
 
 

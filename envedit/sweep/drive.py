@@ -17,7 +17,7 @@ from typing import TextIO
 from envedit.core.atomic_files import make_folder, write_atomically
 from envedit.core.errors import ConfigError
 from envedit.core.extras import required
-from envedit.core.processor import cores
+from envedit.core.machine import cores
 from envedit.core.types import FilePath
 
 from .jobs import Job

@@ -19,7 +19,7 @@ import envedit
 from envedit.core import file_locks
 from envedit.core.atomic_files import make_folder, write_atomically
 from envedit.core.errors import InputError
-from envedit.core.processor import cores
+from envedit.core.machine import cores
 from envedit.core.types import FilePath
 
 from .jobs import Job, program

@@ -21,7 +21,6 @@ which stay as they are.
 from __future__ import annotations
 
 import contextlib
-import difflib
 import functools
 import hashlib
 import os
@@ -34,6 +33,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from envedit.config.validators import meant
 from envedit.core import installed_plugins, latlong, shipped
 from envedit.core.color import tonemap
 from envedit.core.errors import ConfigError, EnveditError, InputError, NumericalError, place_of
@@ -534,9 +534,8 @@ def find(file: FilePath) -> Path:
         return shipped.folder() / f"{name}.xml"
     if os.path.isdir(path):
         raise InputError(f"scene {file}: this is a folder, expected a Mitsuba XML or USD file")
-    close = difflib.get_close_matches(name, names, 1) if bare else []
     expected = f"expected a Mitsuba XML or USD file or one of {', '.join(names)}"
-    hint = f"did you mean {close[0]}?" if close else expected
+    hint = meant(name, names, expected) if bare else expected
     raise InputError(f"scene {file}: no such file; {hint}")
 
 
@@ -565,13 +564,10 @@ def _check_parameters(path: Path, parameters: dict) -> tuple[dict[str, str], sce
     used, defaults = outline.used, outline.defaults
     for name in parameters:
         if name not in used | defaults:
-            close = difflib.get_close_matches(str(name), used | defaults, 1)
             known = ", ".join(sorted(used | defaults)) or "none"
-            raise ConfigError(
-                f"scene.parameters: {path.name} has no parameter {name}"
-                + (f"; did you mean {close[0]}?" if close else "")
-                + f" (known: {known})"
-            )
+            hint = meant(name, used | defaults, "")
+            hint = f"; {hint}" if hint else ""
+            raise ConfigError(f"scene.parameters: {path.name} has no parameter {name}{hint} (known: {known})")
     if missing := sorted(used - defaults - parameters.keys()):
         raise ConfigError(
             f"scene.parameters: {path.name} needs {', '.join(missing)}, which has no default; give it: "

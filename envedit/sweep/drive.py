@@ -37,7 +37,6 @@ def sweep(
     workers: int | None = None,
     scheduler: str | None = None,
     threads: int | None = None,
-    command: Sequence[str] = (),
     stream: TextIO | None = None,
 ) -> list[Outcome]:
     """Carry out all jobs that are not done, and report the progress.
@@ -63,8 +62,6 @@ def sweep(
         Address of a Dask scheduler; ``workers`` does not count then.
     threads : int, optional
         Threads of a job; None: the cores divided by the jobs at a time.
-    command : sequence of str
-        What carries out every job, as :data:`.process.COMMAND`; empty: what each job says.
     stream : file, optional
         Where a line on each job is written as it ends; None: nowhere.
 
@@ -97,7 +94,7 @@ def sweep(
     # ---- Carry it out
     if to_run:
         done_before = f"{len(distinct)} jobs, {len(outcomes)} done before, {len(to_run)} to run"
-        run = functools.partial(run_job, out=out, command=tuple(command))
+        run = functools.partial(run_job, out=out)
         if scheduler is None:
             workers = min(workers or max(1, cores() // CORES_PER_JOB), len(to_run))
             engine = _on_this_machine(run, workers, threads)

@@ -12,6 +12,7 @@ from envedit.cli.console import Console, exit_code, make_parser
 from envedit.cli.streams import steady
 from envedit.config import presets
 from envedit.core.array_cache import cache_folder
+from envedit.core.atomic_files import write_atomically
 from envedit.images import images
 from envedit.losses import metrics
 from envedit.report import manifest, output_folder, preview
@@ -93,7 +94,7 @@ def _fit(arguments, settings, original, folder, console):
     marks = {"source": arguments.map, "rows": f"{rows.first} to {rows.last}"}
     whole = len(reproduced) == len(original)
     images.write_exr(folder / "fitted.exr", reproduced, marks, panorama=whole)
-    preview.preview(folder / "preview.png", {"map": active, "fit": reproduced}, {})
+    write_atomically(folder / "preview.png", preview.sheet({"map": active, "fit": reproduced}, {}))
 
     # ---- How good it is
     numbers = {

@@ -27,17 +27,18 @@ EPHEMERIS = [
 
 @pytest.mark.parametrize(("latitude", "longitude", "time", "azimuth", "elevation"), EPHEMERIS)
 def test_the_sun_stands_where_the_ephemeris_has_it(latitude, longitude, time, azimuth, elevation):
-    sun = sun_position.sun_position(latitude, longitude, sun_position.moment(time))
-    assert sun.elevation == pytest.approx(elevation, abs=0.02)  # of it 0.01 are refraction at the horizon
-    off = np.radians(sun.azimuth - azimuth) * np.cos(np.radians(elevation))
+    sun_azimuth, sun_elevation = sun_position.sun_position(latitude, longitude, sun_position.moment(time))
+    assert sun_elevation == pytest.approx(elevation, abs=0.02)  # of it 0.01 are refraction at the horizon
+    off = np.radians(sun_azimuth - azimuth) * np.cos(np.radians(elevation))
     assert abs(np.degrees(off)) < 0.01
 
 
 def test_poles_and_dates_at_the_ends_are_finite():
     for latitude in (-90, 90):
         for year in sun_position.YEARS:
-            sun = sun_position.sun_position(latitude, 0, sun_position.moment(f"{year}-06-21T00:00Z"))
-            assert abs(abs(sun.elevation) - 23.45) < 0.1 and 0 <= sun.azimuth < 360
+            moment = sun_position.moment(f"{year}-06-21T00:00Z")
+            azimuth, elevation = sun_position.sun_position(latitude, 0, moment)
+            assert abs(abs(elevation) - 23.45) < 0.1 and 0 <= azimuth < 360
 
 
 def test_the_sun_of_the_map_is_at_that_azimuth_from_north_and_elevation(tmp_path, capsys):

@@ -321,7 +321,7 @@ def damaged_files(folder, rng):
     os.mkfifo(folder / "pipe.exr")
     yield from (
         ("folder.exr", "is a folder"),
-        ("pipe.exr", "not a regular file"),
+        ("pipe.exr", "no regular file"),
         ("gone.exr", "no such file"),
     )
 

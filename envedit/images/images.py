@@ -259,20 +259,13 @@ def _remedy(image, info):
 
 def _of_array(values: np.ndarray, name: str, space: str) -> tuple[np.ndarray, dict]:
     """Take a map from an array as :func:`read` takes one from a file."""
-    if values.ndim != 3 or values.shape[2] != 3 or values.dtype.kind not in "fiu":
+    if values.ndim != 3 or values.shape[2] != 3:
         what = f"shape {values.shape} of {values.dtype}"
         raise InputError(f"{name}: got an array of {what}, expected (H, 2 H, 3) numbers")
-    with np.errstate(over="ignore"):  # what leaves float32 becomes infinite, and is named as such
-        image = np.array(values, np.float32)
-    size = image.shape[1], image.shape[0]
+    size = values.shape[1], values.shape[0]
     info: Info = {"path": name, "format": None, "size": size, "hdr": True, "metadata": {}, "warnings": []}
     info["marks"] = {}
-    if values.dtype in (np.uint8, np.uint16):
-        info["warnings"].append(
-            f"an array of {values.dtype} is taken as linear radiance: codes of a picture have to be "
-            f"divided by {np.iinfo(values.dtype).max}, and their curve undone, before"
-        )
-    return marks.honour(image, info, space), info
+    return marks.honour(values.astype(np.float32), info, space), info
 
 
 # ---- Writing -----------------------------------------------------------------------------------------------

@@ -30,10 +30,7 @@ def make_parser(
 class Console:
     """What a run writes: lines to stdout, progress, warnings and errors to stderr, the object of ``--json``.
 
-    Attributes
-    ----------
-    facts : dict
-        What the object of ``--json`` will have beside the exit code.
+    ``facts`` is what the object of ``--json`` will have beside the exit code.
     """
 
     def __init__(

@@ -303,21 +303,14 @@ def load(
     sensor is unknown, missing or unusable, or the size is. InputError if files are missing or damaged, the
     scene has several environment emitters, or something that is not supported; all that is found is named.
 
-    Parameters
-    ----------
-    file : path, str or dict
-        A Mitsuba XML file, a USD file (:func:`.usd.conversion.kept`), the name of a shipped scene
-        (:func:`.shipped.scenes`, with or without ``.xml``; a file of that name in the working folder comes
-        first), or a dict as ``mi.load_dict`` takes it.
-    width, height : int, optional
-        Size of the rendering in pixels. None or 0: the scene's own, or by its aspect if one of both is given.
-    sampler : str
-        Sampler of Mitsuba's renderings, where the scene has none or ``independent``. Stratified
-        samples, 256 a pixel, have 8 dB less noise than as many independent ones in the shipped scenes.
-    up : str
-        Axis of the map's zenith, as of :func:`.parser.replace_environment`.
-    scale : float or "auto"
-        What maps are multiplied by, in place of the ``scale`` of the emitter.
+    ``file`` is a Mitsuba XML file, a USD file (:func:`.usd.conversion.kept`), the name of a shipped scene
+    (:func:`.shipped.scenes`, with or without ``.xml``; a file of that name in the working folder comes
+    first), or a dict as ``mi.load_dict`` takes it. ``width`` and ``height`` are of the rendering, pixels;
+    None or 0: the scene's own, or by its aspect if one of both is given. ``sampler`` is that of Mitsuba's
+    renderings where the scene has none or ``independent``: stratified samples, 256 a pixel, have 8 dB less
+    noise than as many independent ones in the shipped scenes. ``up`` is the axis of the map's zenith, as of
+    :func:`.parser.replace_environment`, ``scale`` what maps are multiplied by in place of the ``scale`` of
+    the emitter.
     """
     if not (mi.variant() or "").endswith("_rgb"):
         raise ConfigError(f"variant: got {mi.variant()}, expected one that ends in _rgb, such as llvm_ad_rgb")

@@ -50,32 +50,14 @@ def sweep(
        outcomes = sweep(jobs, "runs/angles")
        measured = [json.loads((job.folder("runs/angles") / "metrics.json").read_text()) for job in jobs]
 
-    Parameters
-    ----------
-    jobs : iterable of Job
-        Those of the same content are run once.
-    out : path
-        Folder of the jobs' folders; ``sweep.tsv`` in it lists names, states, seconds, folders and errors.
-    workers : int, optional
-        Jobs at a time on this machine; None: one for every four cores.
-    scheduler : str, optional
-        Address of a Dask scheduler; ``workers`` does not count then.
-    threads : int, optional
-        Threads of a job; None: the cores divided by the jobs at a time.
-    stream : file, optional
-        Where a line on each job is written as it ends; None: nowhere.
+    Jobs of the same content are run once. ``out`` is the folder of the jobs' folders; ``sweep.tsv`` in it
+    lists names, states, seconds, folders and errors. There are ``workers`` jobs at a time on this machine, by
+    default one for every four cores; with a ``scheduler``, the address of Dask's, that does not count. A job
+    has ``threads`` threads, by default the cores divided by the jobs at a time. A line on each job is written
+    to ``stream`` as it ends. Returns an outcome for each of ``jobs``, in their order.
 
-    Returns
-    -------
-    list of Outcome
-        One for each of ``jobs``, in their order.
-
-    Raises
-    ------
-    ConfigError, InputError
-        Two jobs of one name; no Dask; no scheduler; a folder that cannot be used.
-    KeyboardInterrupt
-        After the running jobs have had time for their checkpoints.
+    ConfigError or InputError for two jobs of one name, no Dask, no scheduler, or a folder that cannot be
+    used; KeyboardInterrupt after the running jobs have had time for their checkpoints.
     """
     jobs = list(jobs)
     out = Path(out).absolute()

@@ -27,6 +27,18 @@ def make_parser(
     )
 
 
+def add_overrides(parser: argparse.ArgumentParser, example: str) -> None:
+    """Add ``--set``, the option ``overrides``: keys of the configuration with other values."""
+    parser.add_argument(
+        "--set",
+        metavar="table.key=value",
+        action="append",
+        default=[],
+        dest="overrides",
+        help=f"change one key of the configuration, such as {example}; may be repeated",
+    )
+
+
 class Console:
     """What a run writes: lines to stdout, progress, warnings and errors to stderr, the object of ``--json``.
 

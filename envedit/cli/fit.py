@@ -8,7 +8,7 @@ import mitsuba as mi
 
 from envedit import config, inputs
 from envedit.cli import doctor
-from envedit.cli.console import Console, exit_code, make_parser
+from envedit.cli.console import Console, add_overrides, exit_code, make_parser
 from envedit.cli.streams import steady
 from envedit.config import presets
 from envedit.core.array_cache import cache_folder
@@ -38,14 +38,7 @@ def main(argv: list[str] | None = None) -> int:
         "--out", metavar="DIR", help="folder for the results (default: MAP_fit in the working folder)"
     )
     parser.add_argument("--preset", choices=tuple(presets.PRESETS), help="named set of defaults")
-    parser.add_argument(
-        "--set",
-        metavar="table.key=value",
-        action="append",
-        default=[],
-        dest="overrides",
-        help="change one key of the configuration, such as fit.epochs=500; may be repeated",
-    )
+    add_overrides(parser, "fit.epochs=500")
     arguments = parser.parse_args(argv)
     goes_on = "running it again goes on where the fit was last kept"
     interrupted = f"interrupted; no results were written ({goes_on})"

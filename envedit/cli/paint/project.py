@@ -12,6 +12,7 @@ from pathlib import Path
 from envedit import config
 from envedit.cli import run
 from envedit.cli.paint.protocol import ORIENTATION, Document
+from envedit.config import presets
 from envedit.core import array_cache, atomic_files, file_locks
 from envedit.core.errors import ConfigError, InputError
 
@@ -178,7 +179,7 @@ def _of_photo(settings, base):
 
 def _path(envmap):
     """Return a word as it is, and a path from the working folder as an absolute one."""
-    return envmap if envmap in ("auto", "scene", "sunsky") else str(Path(envmap).absolute())
+    return envmap if envmap in presets.MAP_WORDS else str(Path(envmap).absolute())
 
 
 def _plain(settings, folder):

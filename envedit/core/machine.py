@@ -28,7 +28,7 @@ def llvm_version() -> str:
 
 
 def llvm_library() -> str | None:
-    """Return the file of the LLVM that Dr.Jit has loaded; None where only Linux could tell.
+    """Return the file of the LLVM that Dr.Jit has loaded; None where the system lists no libraries.
 
     It is named libLLVM, or as DRJIT_LIBLLVM_PATH says.
     """

@@ -487,24 +487,23 @@ class _Edit:
         if measures["painted"] and (unnatural := naturalness.warning(measures["natural"])):
             self.warnings.append(unnatural)
 
-        # ---- The rendering, of painted targets on the painted pixels
+        # ---- The rendering, of painted targets the share of the paint
         pair = [measures["render"], measures["initial"]]
-        where = ""
-        if self.target.coverage is not None:
-            where = " where painted"
-            tonemap = self.settings.output.tonemap
-            painted = self.target.coverage[..., 0] > 0
-            pair = [
-                metrics.compare(picture, self.target.picture, tonemap, None, painted)
-                for picture in (self.renders["edited"], self.unedited)
-            ]
         after, before = (metrics.score(one, pair, 2) for one in pair)
         rate = "; lower optimizer.lr" if adam_solver.raised_rate(self.job) else ""
-        measures["worse"] = metrics.worse(*pair)
+        if measures["painted"]:
+            towards = measures["painted"]["towards"]
+            measures["worse"] = towards is not None and towards < 0
+            nothing = towards is not None and 0 <= towards < LEAST_GAIN
+            how = f"{100 * (towards or 0):.0f} % of the painted change"
+        else:
+            measures["worse"] = metrics.worse(*pair)
+            nothing = metrics.off(pair[0], pair) and metrics.gained(*pair) < LEAST_GAIN
+            how = f"{after} from the target now, {before} before"
         if measures["worse"]:
             self.warnings.append(
-                f"the result is farther from the target than the input{where}: {after} now, {before} before; "
-                f"the edited map is kept anyway: look at it before you use it{rate}"
+                f"the result is farther from the target than the input: {how}; the edited map is kept "
+                f"anyway: look at it before you use it{rate}"
             )
 
         # ---- The map
@@ -518,10 +517,10 @@ class _Edit:
 
         # ---- The solver
         solving = self.job.settings.optimizer.iterations > 0 and not measures["worse"]
-        if solving and metrics.off(pair[0], pair) and metrics.gained(*pair) < LEAST_GAIN:
+        if solving and nothing:
             self.warnings.append(
-                f"the edit achieved nothing in {state.step} steps: {after} from the target{where} now, "
-                f"{before} before; check the target's exposure, and that the map lights what is to change"
+                f"the edit achieved nothing in {state.step} steps: {how}; check the target's exposure, and "
+                "that the map lights what is to change"
             )
         if state.bad_steps:
             self.warnings.append(

@@ -45,11 +45,17 @@ def main(argv: list[str] | None = None) -> int:
         choices=sorted(QUARTERS),
         help="at last turn the map so that it stands in another program as in a Mitsuba scene",
     )
+    parser.add_argument("--background", metavar="OUT", help="write a second map, to be seen and not to light")
     parser.add_argument(
-        "--background", metavar="FILE", help="write a second map, to be seen and not to light"
+        "--background-blur", type=number(0, 180), metavar="DEGREES", default=0.0, help="blur of that map"
     )
-    parser.add_argument("--background-blur", type=number(0, 180), metavar="DEGREES", default=0.0)
-    parser.add_argument("--background-exposure", type=number(-100, 100), metavar="STOPS", default=0.0)
+    parser.add_argument(
+        "--background-exposure",
+        type=number(-100, 100),
+        metavar="STOPS",
+        default=0.0,
+        help="exposure of that map",
+    )
     return map_command.run(parser, argv, _adjust)
 
 
@@ -65,7 +71,7 @@ def _adjust(arguments, console):
         names = ", ".join(f"--{name}" for name in (*OPTIONS, "for"))
         raise ConfigError(f"nothing to adjust: give one of {names}")
     if second != Adjustments() and not arguments.background:
-        raise ConfigError("--background-blur and --background-exposure need --background FILE")
+        raise ConfigError("--background-blur and --background-exposure need --background OUT")
 
     # ---- Where it goes
     path = map_file.output_path(arguments.out, "adjusted", [arguments.map], arguments.overwrite)

@@ -54,4 +54,4 @@ def _blend(arguments, console):
         values = map_file.as_stored(radiance, first)
     map_command.write(path, values, first, console)
     console.facts |= {"files": {"map": str(path)}, "amount": arguments.amount, "lights": lights}
-    console.say(f"{len(lights)} lights; {path}" if lights else str(path))
+    console.say(f"{len(lights)} light{'s' * (len(lights) != 1)}; {path}" if lights else str(path))

@@ -62,7 +62,7 @@ def _lights(arguments, console):
     console.facts |= {"folder": str(folder), "files": files, **about}
     for line in _table(numbered):
         console.say(line)
-    console.say(f"{len(numbered)} lights; results in {folder}")
+    console.say(f"{len(numbered)} light{'s' * (len(numbered) != 1)}; results in {folder}")
 
 
 def _table(lights):

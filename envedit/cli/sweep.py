@@ -22,7 +22,7 @@ def main(argv: list[str] | None = None) -> int:
             "envedit sweep jobs.toml --out runs/sweep --workers 2",
             "envedit sweep jobs.toml --out /shared/runs --scheduler tcp://HOST:8786",
         ],
-        "A scheduler and its workers are Dask's (pip install 'envedit-hdr[cluster]'):\n"
+        "A scheduler and its workers are Dask's (pip install '.[cluster]' in a checkout):\n"
         "  dask scheduler                              # prints its address, tcp://HOST:8786\n"
         "  dask worker tcp://HOST:8786 --nthreads 1    # on each node; a thread is a job at a time",
     )

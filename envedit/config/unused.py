@@ -42,6 +42,9 @@ def _reason(config: Config, when: When, solver: str | None) -> str:
         value = getattr(getattr(config, table), key)
         if value in values if values else value:
             continue
+        check = FIELDS[table][key].metadata["check"]
+        if isinstance(check, Choice) and value not in check.names:  # the kind of an installed package
+            continue
         expected = _values(other, values)
         sign = "" if not values or expected.startswith("other than ") else "= "
         return f"no effect: needs {other} {sign}{expected}, got {quote(value)}"

@@ -172,7 +172,9 @@ def _repaired(image, info, repair):
         return image
     if not repair:
         where = f"{info['repaired']} texels are NaN or infinite, the first at {place_of(bad)}"
-        raise InputError(f"{name}: {where}; repair the map, or ask for repair")
+        raise InputError(
+            f"{name}: {where}; repair the map, or set input.repair = true (of commands on maps: --repair)"
+        )
     try:
         image, overflowed, replaced = radiance.repair(image)
     except InputError as e:

@@ -77,7 +77,7 @@ class Reach:
         if self.share >= WARNED_SHARE:
             return None
         left = "brighter" if self.too_dark >= WARNED_SHARE else "darker"
-        without = "" if self.all_painted else f" without making pixels {left} that are held"
+        without = "" if self.all_painted else f" without making other pixels {left}"
         return (
             f"only {_percent(self.share)} % of the painted change is feasible under any map: "
             f"most of the rest cannot become {left}{without}; see unreachable.png"

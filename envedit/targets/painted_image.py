@@ -207,7 +207,9 @@ def _spread_of_resampling(file, size, shape, warnings):
         raise InputError(sizes + "another aspect; paint on the picture that --export-initial writes")
     if max(columns, width) > MOST_RESIZED * min(columns, width):
         raise InputError(f"{sizes}more than {MOST_RESIZED} times apart; save it at the size of the export")
-    warnings.append(f"{sizes}resampled; faint or thin paint is not found: better keep the size of the export")
+    warnings.append(
+        f"{sizes}resampled, by which faint or thin paint is lost: better keep the size of the export"
+    )
     return int(np.ceil(3 * max(1, height / rows, width / columns)))
 
 

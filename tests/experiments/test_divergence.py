@@ -56,9 +56,8 @@ def test_the_loss_of_a_noisy_rendering_is_the_judged_loss_and_its_variance(small
     sky = divergence.sky()
     render = divergence.path_tracing(scene, 4)
     target = mi.TensorXf(divergence.path_tracing(scene, 4096)(mi.TensorXf(sky), 99).numpy())
-    losses = [
-        float(divergence.squared_error(render(mi.TensorXf(sky), step), target).array[0]) for step in range(64)
-    ]
+    errors = (divergence.squared_error(render(mi.TensorXf(sky), step), target) for step in range(64))
+    losses = [float(error.array[0]) for error in errors]
     judged = [divergence.judge(scene, render, mi.TensorXf(sky), sky, target, 10 * k) for k in range(32)]
     variance = [point["variance"] for point in judged]
     spread = math.hypot(np.std(losses) / 8, np.std(variance) / math.sqrt(32))

@@ -15,28 +15,14 @@ from tests.oracles.tiers import slow_but
 
 linux = pytest.mark.skipif(sys.platform != "linux", reason="memory of a process is read from /proc")
 
+
 # ---- the package -------------------------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 @linux
-@pytest.mark.parametrize(
-    ("what", "cases"),
-    slow_but(
-        [
-            ("map", 80),
-            ("toml", 40),
-            ("painted", 30),
-            ("weights", 30),
-            ("scene", 30),
-            ("asset", 8),
-            ("entry", 8),
-            ("checkpoint", 40),
-        ],
-        "map",
-        "toml",
-    ),
-)
+@pytest.mark.parametrize(("what", "cases"), slow_but([
+    ("map", 80), ("toml", 40), ("painted", 30), ("weights", 30), ("scene", 30), ("asset", 8), ("entry", 8),
+    ("checkpoint", 40),
+], "map", "toml"))  # fmt: skip
 def test_damaged_files_are_read_or_refused(what, cases, tmp_path):
     found = drive.piece(Config(), tmp_path, what, 0, cases)
     counts, errors = found["counts"], found["errors"]
@@ -139,28 +125,14 @@ def read(path, index):
 
 @pytest.mark.slow
 @linux
-@pytest.mark.parametrize(
-    ("kind", "outcome", "words"),
-    slow_but(
-        [
-            ("crashed", "crashed", "SIGSEGV"),
-            ("hung", "hung", "of processor time"),
-            ("stuck", "hung", "of wall time"),
-            ("traceback", "traceback", "KeyError"),
-            ("nameless", "unclear", "does not name the file"),
-            ("control", "unclear", "control characters"),
-            ("lengthy", "unclear", "1 lines, "),
-            ("wrong", "wrong", "not finite"),
-            ("memory", "memory", "MiB for 0 bytes"),
-            ("address", "memory", "not enough memory"),
-            ("printed", "printed", "from C"),
-            ("warned", "printed", "from Python"),
-        ],
-        "crashed",
-        "memory",
-        "printed",
-    ),
-)
+@pytest.mark.parametrize(("kind", "outcome", "words"), slow_but([
+    ("crashed", "crashed", "SIGSEGV"), ("hung", "hung", "of processor time"),
+    ("stuck", "hung", "of wall time"), ("traceback", "traceback", "KeyError"),
+    ("nameless", "unclear", "does not name the file"), ("control", "unclear", "control characters"),
+    ("lengthy", "unclear", "1 lines, "), ("wrong", "wrong", "not finite"),
+    ("memory", "memory", "MiB for 0 bytes"), ("address", "memory", "not enough memory"),
+    ("printed", "printed", "from C"), ("warned", "printed", "from Python"),
+], "crashed", "memory", "printed"))  # fmt: skip
 def test_every_fault_is_seen(tmp_path, monkeypatch, kind, outcome, words):
     (tmp_path / "bad.py").write_text(BAD)
     (tmp_path / "case").write_text(kind)
@@ -207,11 +179,8 @@ def test_a_whole_file_that_is_not_read_is_a_fault(tmp_path, monkeypatch):
 def test_a_case_is_the_same_file_every_time():
     for what in ("map", "toml", "weights"):
         files = kinds.seeds(what)
-        one, again = (
-            [kinds.case(what, files, 0, i) for i in order] for order in (range(30), range(29, -1, -1))
-        )
-        assert one == again[::-1]
-        other = [kinds.case(what, files, 1, i) for i in range(30)]
+        one, other = ([kinds.case(what, files, seed, i) for i in range(30)] for seed in (0, 1))
+        assert one == [kinds.case(what, files, 0, i) for i in reversed(range(30))][::-1]
         assert sum(a == b for a, b in zip(one, other, strict=True)) < 3
         assert sum(data == dict(files)[name] for name, data in one) < 6  # nearly all are damaged
 
@@ -228,9 +197,8 @@ def test_pieces_of_a_kind_add_up_and_faults_are_named(tmp_path):
         piece("toml", {"read": 3}, 0),
     ]
     rows = rows_of(experiment.EXPERIMENT, pieces)
-    lines = [
-        [cell.strip() for cell in line.split("|")] for line in table(experiment.EXPERIMENT, rows).splitlines()
-    ]
+    text = table(experiment.EXPERIMENT, rows)
+    lines = [[cell.strip() for cell in line.split("|")] for line in text.splitlines()]
     assert lines[2][1:7] == ["map", "6", "1", "4", "0", "1"] and lines[2][-2] == "3.0 MiB"
     assert lines[3][1:5] == ["toml", "3", "3", "0"] and len(lines) == 4
     assert experiment.failures(rows) == [f"map 7: hung: 5 s (kept in {tmp_path})"]

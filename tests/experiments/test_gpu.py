@@ -25,7 +25,7 @@ def steps(monkeypatch):
     return made
 
 
-def test_both_variants_are_measured_and_stand_beside_each_other(tmp_path, steps, capsys):
+def test_both_variants_are_measured_and_without_a_gpu_the_cpu_alone(tmp_path, steps, capsys):
     out = tmp_path / "gpu.json"
     steps["solver", "llvm_ad_rgb"] = {"error": "slow"}  # the CPU is only there to compare with
     assert gpu.main([str(out), "--small"]) == 0
@@ -33,9 +33,6 @@ def test_both_variants_are_measured_and_stand_beside_each_other(tmp_path, steps,
     assert list(found["steps"]) == ["doctor", "quickstart", "engine", "solver", "fit"]
     assert all(list(one) == ["cuda_ad_rgb", "llvm_ad_rgb"] for one in found["steps"].values())
     assert found["machine"]["cores"] and "cuda_ad_rgb fit: 1.0 s" in capsys.readouterr().out
-
-
-def test_without_a_gpu_the_cpu_is_measured_and_the_exit_code_says_so(tmp_path, steps):
     steps["doctor", "cuda_ad_rgb"] = {"error": "no GPU"}
     assert gpu.main([str(tmp_path / "gpu.json"), "--small"]) == 1
     found = json.loads((tmp_path / "gpu.json").read_text())["steps"]
@@ -72,14 +69,9 @@ def test_the_script_measures_at_tiny_sizes(tmp_path):
     """Other tests run what *doctor* and *engine* do, and *quickstart* is as *solver*."""
     script = ROOT / "experiments/gpu.sh"
     command = ["bash", script, tmp_path / "gpu.json", "--small", "--steps", "solver", "fit"]
-    own = {"PYTHON": sys.executable, "XDG_CACHE_HOME": str(tmp_path / "cache")}
-    done = subprocess.run(
-        [*command, "--variant", "llvm_ad_rgb"],
-        env=os.environ | own,
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-    )
+    command += ["--variant", "llvm_ad_rgb"]
+    own = os.environ | {"PYTHON": sys.executable, "XDG_CACHE_HOME": str(tmp_path / "cache")}
+    done = subprocess.run(command, env=own, cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
     steps = json.loads((tmp_path / "gpu.json").read_text())["steps"]
     found = {step: one["llvm_ad_rgb"] for step, one in steps.items()}

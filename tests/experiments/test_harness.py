@@ -1,6 +1,5 @@
 """Experiments: cases that are run once, tables and sheets of what is done, the shared command line."""
 
-import argparse
 import json
 import math
 import re
@@ -10,10 +9,9 @@ import numpy as np
 import pytest
 
 import experiments.__main__ as command
-from envedit import config, sweep
+from envedit import config
 from envedit.core.errors import ConfigError, InputError
 from experiments import harness
-from experiments.constants.experiment import constants
 from experiments.harness import Case, Done, Experiment, markdown, montage
 
 STUB = (
@@ -112,13 +110,19 @@ def test_a_case_may_be_a_function(tmp_path, capsys, monkeypatch):
     assert len(keys) == 3
 
 
-def test_rows_may_be_combined(tmp_path):
+def test_rows_are_combined_into_tables_and_panels_into_montages(tmp_path):
     made = Experiment(
         lambda given: [],
         columns={"kind": "{kind}", "sum": "{n}"},
         combine=lambda rows: [{"kind": "both", "n": sum(row["n"] for row in rows)}],
     )
     assert harness.table(made, [{"n": 1}, {"n": 2}]).endswith("| both | 3 |")
+    assert markdown(["a", "b"], [["1", "2"]]) == "| a | b |\n| --- | --- |\n| 1 | 2 |"
+    gap = harness.GAP
+    made = montage([[np.full((2, 3, 3), 0.5), np.ones((4, 4, 3))], [np.full((4, 1, 3), 2.0)]])
+    assert made.shape == (2 * (4 + gap), 6 + 4 + 2 * gap, 3) and made.dtype == np.uint8
+    assert (made[:4, :6] == 128).all() and (made[:4, 6 + gap : 10 + gap] == 255).all()
+    assert (made[4 + gap : 8 + gap, :1] == 255).all() and not made[4 + gap :, 1:].any()
 
 
 def test_user_errors_are_one_line(run, tmp_path):
@@ -140,50 +144,11 @@ def test_an_override_beats_the_case_and_a_target_file_its_turn():
     assert tables == {"seed": 1, "target": {"rotate_degrees": 60.0, "spp": 8}}
 
 
-def test_tables_and_montages():
-    assert markdown(["a", "b"], [["1", "2"]]) == "| a | b |\n| --- | --- |\n| 1 | 2 |"
-    gap = harness.GAP
-    made = montage([[np.full((2, 3, 3), 0.5), np.ones((4, 4, 3))], [np.full((4, 1, 3), 2.0)]])
-    assert made.shape == (2 * (4 + gap), 6 + 4 + 2 * gap, 3) and made.dtype == np.uint8
-    assert (made[:4, :6] == 128).all() and (made[:4, 6 + gap : 10 + gap] == 255).all()
-    assert (made[4 + gap : 8 + gap, :1] == 255).all() and not made[4 + gap :, 1:].any()
-
-
 MAPS = [
     "aristea_wreck", "autumn_field", "evening_road_01", "kloofendal_48d_partly_cloudy", "kloppenheim_06",
     "mud_road", "overcast_soil", "rustig_koppie", "snow_field", "sunflowers", "syferfontein_18d_clear",
     "wasteland_clouds",
 ]  # fmt: skip
-COUNTS = {
-    "constants": 1 + len({one.module for one in constants()}),
-    "divergence": 4,
-    "engine": 47,
-    "fuzz": 29,
-    "interiors": 5,
-    "layers": 96,
-    "layers.moved_lights": 12,
-    "light_estimation": 6,
-    "looks": 12,
-    "maps_alone": 34,
-    "natural": 680,
-    "natural.aureoles": len(MAPS),
-    "natural.skies": 1,
-    "paint.artists": 12,
-    "paint.figure10": 7,
-    "paint.rates": 3,
-    "paint.soak": 1,
-    "painted_edits": 18,
-    "painted_edits.artists": 296,
-    "paper": 720,
-    "photograph": 396,
-    "pictures": 30,
-    "scenes": 6,
-    "solver.edits": 14,
-    "tradeoff": 6,
-    "unclip": 12,
-    "unclip.constants": 4,
-}
-"""Cases of every experiment over these maps."""
 
 
 @pytest.fixture
@@ -202,23 +167,12 @@ def test_every_experiment_makes_its_cases(name, data, tmp_path, capsys):
     if name == "paper":
         asked.append("table3")
     assert command.main(asked) == 0
-    assert capsys.readouterr().out.endswith(f"\n{COUNTS[name]} jobs: {COUNTS[name]} missing\n")
+    assert re.search(r"\n([1-9]\d*) jobs?: \1 missing\n$", capsys.readouterr().out)
 
 
 def test_experiments_are_listed_and_an_unknown_one_is_named(capsys):
     assert command.main(["--help"]) == 0
     lines = capsys.readouterr().out.splitlines()[2:]
-    assert [line.split()[0] for line in lines] == list(command.modules()) == list(COUNTS)
+    assert [line.split()[0] for line in lines] == list(command.modules())
     assert command.main(["layer"]) == 2
     assert re.search("got layer, expected one of .*interiors, layers", capsys.readouterr().err)
-
-
-def test_the_same_options_everywhere():
-    parser = argparse.ArgumentParser()
-    harness.add_options(parser, harness.Path("runs/x"))
-    given = parser.parse_args(["--set", "a.b=1", "--set", "c=2", "--only", "x", "y", "--scheduler", "h:1"])
-    assert (given.sets, given.only, given.scheduler) == (["a.b=1", "c=2"], ["x", "y"], "h:1")
-    assert json.dumps(sorted(vars(given))) == json.dumps(
-        ["dry_run", "only", "out", "scheduler", "sets", "threads", "workers"]
-    )
-    assert Case("x", {}).command == sweep.COMMAND

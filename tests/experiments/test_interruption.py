@@ -81,8 +81,6 @@ def check_resumed(path, folder, reference):
 
 
 # ---- killed at a file ------------------------------------------------------------------------------------
-
-
 @contextlib.contextmanager
 def killed_at(patch, number):
     """Kill at the n-th renaming of a temporary file, which is cut in half; yields what was renamed."""
@@ -195,12 +193,8 @@ def test_what_killed_writers_left_is_removed_and_nothing_else(tmp_path):
     gone.wait()
     left = {f".edited.exr.{gone.pid}.exr", f".metrics.json.{os.getpid()}", f".checkpoint.npz.{gone.pid}"}
     left |= {".edited.exr.99999999999999999999.exr"}
-    others = {
-        f".edited.exr.{os.getppid()}.exr",
-        ".edited.exr.note",
-        f".mine.exr.{gone.pid}.exr",
-        "edited.exr",
-    }
+    others = {f".edited.exr.{os.getppid()}.exr", f".mine.exr.{gone.pid}.exr"}
+    others |= {".edited.exr.note", "edited.exr"}
     for name in left | others:
         (tmp_path / name).write_bytes(b"half")
     output_folder.tidy(tmp_path)
@@ -209,8 +203,6 @@ def test_what_killed_writers_left_is_removed_and_nothing_else(tmp_path):
 
 
 # ---- no space, no folder ---------------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 def test_a_disk_that_is_full_at_a_file_is_told_and_costs_no_work(tmp_path, whole, monkeypatch, capsys):
     """Several files in turn, and the run goes on from its checkpoint as soon as there is room."""
@@ -316,10 +308,8 @@ def test_a_write_that_comes_short_leaves_no_file(name, tmp_path):
     data = path.read_bytes()
     path.unlink()
     for size in (0, 100, len(data) // 2, len(data) - 100, len(data) - 1):
-        with (
-            pytest.raises(InputError, match=f"{name}: cannot be written .File too large."),
-            largest_file(size),
-        ):
+        said = f"{name}: cannot be written .File too large."
+        with pytest.raises(InputError, match=said), largest_file(size):
             WRITERS[name](path)
         assert names(tmp_path) == set()
     with largest_file(len(data)):

@@ -37,46 +37,28 @@ def lights(*azimuths):
 
 
 # ---- Measures of pictures ----------------------------------------------------------------------------------
-
-
-def test_errors_are_summed_over_channels_and_divided_by_pixels():
-    """Squared errors 1 and 1 + 4, whose mean is 3; the best factor is 1; angles 0 and 90 degrees."""
-    found = protocol.compared(picture((1, 0, 0), (0, 1, 0)), picture((2, 0, 0), (0, 0, 2)))
-    assert found["rmse"] == pytest.approx(math.sqrt(3)) and found["si_rmse"] == pytest.approx(math.sqrt(3))
-    assert found["angle"] == pytest.approx(45)
-
-
-def test_one_factor_for_all_pixels():
-    """(1, 1, 1) and (1, 1, 1) against 1 and 3 of gray: factor 2, errors 3 and 3 in both pixels."""
-    found = protocol.compared(picture((1, 1, 1)), picture((1, 1, 1), (3, 3, 3)))
-    assert found["rmse"] == pytest.approx(math.sqrt(6)) and found["si_rmse"] == pytest.approx(math.sqrt(3))
-    assert found["angle"] == pytest.approx(0, abs=1e-5)
-
-
-def test_each_picture_is_normalised_by_itself():
-    """1 everywhere is 1; 2 and 4 are 1/2 and 1: an error of 3/4 in half of the pixels."""
-    found = protocol.compared(picture((1, 1, 1)), picture((2, 2, 2), (4, 4, 4)))
-    assert found["normalised"] == pytest.approx(math.sqrt(0.375))
-    assert protocol.compared(picture((1, 2, 3)), picture((5, 10, 15)))["normalised"] == pytest.approx(0)
-
-
-def test_one_colour_differs_by_its_factor_alone():
-    found = protocol.compared(picture((1, 2, 3)), picture((3, 6, 9)))
-    assert found["rmse"] == pytest.approx(math.sqrt(56))
-    assert found["si_rmse"] == pytest.approx(0, abs=1e-6) and found["angle"] == pytest.approx(0, abs=1e-5)
-
-
-def test_a_black_picture_has_the_error_of_the_true_one_and_no_angle():
-    black = picture((0, 0, 0))
-    found = protocol.compared(black, picture((1, 1, 1)))
-    assert [found[key] for key in ("rmse", "si_rmse", "normalised")] == pytest.approx([math.sqrt(3)] * 3)
-    assert math.isnan(found["angle"])
-    assert protocol.compared(black, black)["rmse"] == 0
+@pytest.mark.parametrize(("found", "true", "expected"), [
+    # Squared errors 1 and 1 + 4, whose mean is 3; the best factor is 1; angles 0 and 90 degrees.
+    (((1, 0, 0), (0, 1, 0)), ((2, 0, 0), (0, 0, 2)), {"rmse": 3, "si_rmse": 3, "angle": 45}),
+    # (1, 1, 1) and (1, 1, 1) against 1 and 3 of gray: factor 2, errors 3 and 3 in both pixels.
+    (((1, 1, 1),), ((1, 1, 1), (3, 3, 3)), {"rmse": 6, "si_rmse": 3, "angle": 0}),
+    # 1 everywhere is 1; 2 and 4 are 1/2 and 1: an error of 3/4 in half of the pixels.
+    (((1, 1, 1),), ((2, 2, 2), (4, 4, 4)), {"normalised": 0.375}),
+    (((1, 2, 3),), ((5, 10, 15),), {"normalised": 0}),
+    (((1, 2, 3),), ((3, 6, 9),), {"rmse": 56, "si_rmse": 0, "angle": 0}),
+    (((0, 0, 0),), ((1, 1, 1),), {"rmse": 3, "si_rmse": 3, "normalised": 3, "angle": math.nan}),
+    (((0, 0, 0),), ((0, 0, 0),), {"rmse": 0}),
+])  # fmt: skip
+def test_errors_are_those_worked_out_by_hand(found, true, expected):
+    """Of squares that are summed over channels and divided by pixels; the angle is in degrees."""
+    errors = protocol.compared(picture(*found), picture(*true))
+    for key, value in expected.items():
+        root = value if key == "angle" else math.sqrt(value)
+        least = {"angle": 1e-5, "si_rmse": 1e-6}.get(key, 1e-12)
+        assert errors[key] == pytest.approx(root, abs=least, nan_ok=True)
 
 
 # ---- Measures of maps --------------------------------------------------------------------------------------
-
-
 def test_angle_between_brightest_directions():
     found, true = constant(), constant()
     found[4, 0], true[4, 4] = 2, 3  # a quarter of the horizon
@@ -108,8 +90,6 @@ def test_irradiance_in_stops_on_six_planes():
 
 
 # ---- Pictures ----------------------------------------------------------------------------------------------
-
-
 def test_the_median_of_positive_values_becomes_a_half():
     envmap = np.zeros((128, 256, 3), np.float32)
     envmap[:64] = [1, 2**2.4, 3**2.4]
@@ -130,18 +110,15 @@ def test_a_constant_map_gives_the_reflectance(mirror):
         found = protocol.render(replace(sphere, samples=8), constant(0.5))
         height, width = len(found) // 2, found.shape[1] // 2
         assert found.shape == (540 // sphere.reduction, 960 // sphere.reduction, 4)
-        assert found[height, width] == pytest.approx([0.4, 0.4, 0.4, 1], rel=0.02)
-        assert not found[0, 0].any()
+        assert found[height, width] == pytest.approx([0.4, 0.4, 0.4, 1], rel=0.02) and not found[0, 0].any()
     area = math.pi * (85 / 36 * 960 * math.tan(math.asin(protocol.RADIUS / math.sqrt(260)))) ** 2
     assert protocol.render(mirror, constant())[..., 3].sum() == pytest.approx(area, rel=1e-3)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "direction, side",
-    [((0, -1, 0), (0, 0)), ((1, 0, 0), (1, 0)), ((-1, 0, 0), (-1, 0)), ((0, 0, 1), (0, 1))],
-    ids=["towards the camera", "right", "left", "above"],
-)
+@pytest.mark.parametrize("direction, side", [
+    ((0, -1, 0), (0, 0)), ((1, 0, 0), (1, 0)), ((-1, 0, 0), (-1, 0)), ((0, 0, 1), (0, 1)),
+], ids=["towards the camera", "right", "left", "above"])  # fmt: skip
 def test_directions_of_blender_are_where_its_camera_sees_them(direction, side, mirror):
     """Blender: +z is up, u = 1/2 - atan2(y, x) / 2 pi, v = 1/2 - asin(z) / pi; the camera looks along +y."""
     x, y, z = direction
@@ -231,8 +208,6 @@ def test_spheres_are_those_of_the_ground_truth(name, most):
 
 
 # ---- Tables ------------------------------------------------------------------------------------------------
-
-
 def test_our_rows_stand_beside_the_published_ones():
     of_spheres = {"rmse": 0.125, "si_rmse": 0.125, "normalised": 0.125, "angle": 0.5}
     rows = [{"kind": "edited", "sphere": name} | of_spheres for name in (*protocol.SPHERES, "mirror")]

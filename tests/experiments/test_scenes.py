@@ -28,16 +28,12 @@ def test_every_scene_of_a_folder_is_a_case_and_other_files_are_none(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "parts, lit_by, refused",
-    [
-        ((PATH, SENSOR, BALL, CONSTANT), "its own", ""),
-        ((PATH, SENSOR, BALL, light(2)), "its own", ""),
-        ((PATH, SENSOR, BALL, LAMP), "analytic sky", ""),
-        ((VOLUME, SENSOR, BALL, MEDIUM, light()), "its own", "participating medium"),
-    ],
-    ids=["constant", "map", "lamp", "medium"],
-)
+@pytest.mark.parametrize("parts, lit_by, refused", [
+    ((PATH, SENSOR, BALL, CONSTANT), "its own", ""),
+    ((PATH, SENSOR, BALL, light(2)), "its own", ""),
+    ((PATH, SENSOR, BALL, LAMP), "analytic sky", ""),
+    ((VOLUME, SENSOR, BALL, MEDIUM, light()), "its own", "participating medium"),
+], ids=["constant", "map", "lamp", "medium"])  # fmt: skip
 def test_a_scene_is_compared_with_mitsuba_or_refused(parts, lit_by, refused, tmp_path, monkeypatch):
     numbers = {name: {"psnr": 30.0} for name in ("render", "initial", "envmap", "initial_envmap")}
     monkeypatch.setattr(experiment.pipeline, "run", lambda settings: SimpleNamespace(metrics=numbers))

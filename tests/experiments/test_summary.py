@@ -17,20 +17,14 @@ def test_a_row_for_each_group_in_the_order_in_which_they_come():
     assert lines[2:] == ["| b | 3 | 15.0 (10), 2 |", "| a | 1 | 30.0 (30), 1 |"]
 
 
-def test_counts_on_either_side_of_a_number():
+def test_numbers_are_counted_and_what_is_not_known_is_a_dash():
     text = Summary({}, {"": "{seam.above[2.5]} {seam.above[3]} {seam.below[3]} {seam.median:.1f}"})(ROWS)
     assert text.endswith("| 2 1 1 3.0 |")
-
-
-def test_what_is_not_known_is_a_dash():
     assert f"{Value('nan'):.1f} {Value(0.125):+.1%} {Value(2):.1f}" == "- +12.5 % 2.0"
     assert f"{Numbers([None]).max:.1f}" == "-" and Numbers([]).above[0] == 0
     row = values({"a": None, "b": 0.5, "c": "text", "d": [1.0], "e": 3})
     assert "{a:.1f} {b:.0%} {c} {e}".format_map(row) == "- 50 % text 3"
     assert Summary({}, {"": "{other.mean:.1f}"})(ROWS).endswith("| - |")
-
-
-def test_columns_write_parts_of_what_a_run_measures():
     rows = [values({"map": one}) for one in ({"psnr": 10.0}, {"psnr": None}, {"psnr": 20.0}, None)]
     assert ["{map[psnr]:.1f}".format_map(row) for row in rows] == ["10.0", "-", "20.0", "-"]
     assert Summary({}, {"": "{map[psnr].mean:.1f}, {map[psnr].count}"})(rows).endswith("| 15.0, 2 |")

@@ -32,7 +32,6 @@ TINY = {
 
 
 def ball(texels, scale=2.0):
-    """Return the dict of a scene: a sphere under a map of its own."""
     turned = mi.ScalarTransform4f().rotate([0, 1, 0], 30)
     look = mi.ScalarTransform4f().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0])
     return {
@@ -72,39 +71,25 @@ def test_the_example_runs(tmp_path, monkeypatch, capsys, here):
 
 
 @pytest.mark.slow
-def test_what_is_saved_runs_to_the_same_map_and_what_was_there_is_moved(tmp_path, own_cache):
-    sky = np.random.default_rng(5).uniform(0.1, 2, (16, 32, 3)).astype(np.float32)
-    picture = np.random.default_rng(6).uniform(0, 1, (16, 16, 3))
-    given = {"scene": envedit.load_scene("sphere", 16, parameters={"roughness": 0.4}), "envmap": sky}
-    mask = picture[..., 0]
-    result = envedit.edit(TINY, target=picture, mask=mask, **given)
-    saved = tmp_path / "out"
-    result.save(saved)
-    found = config.load(saved / "config.toml")
-    assert found.scene.parameters == {"roughness": 0.4} and found.target.kind == "image"
-    again = pipeline.run(found)
-    assert np.array_equal(again.envmap, result.envmap) and again.given.size == (32, 16)
-    before = result.metrics["timing"]["total_s"], list(result.warnings)
-    result.save(saved)  # a second time: the first is moved aside, and the result is as it was
-    assert (saved / "earlier-1" / "given_envmap.exr").exists() and (saved / "given_mask.exr").exists()
-    assert (result.metrics["timing"]["total_s"], result.warnings) == before
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["image", "rendering"])
-def test_a_picture_is_paint_or_with_its_kind_a_rendering_of_the_scene(kind, tmp_path, own_cache):
-    """What is saved says which, and runs to the same map."""
+def test_a_picture_is_paint_or_a_rendering_and_what_is_saved_runs_to_the_same_map(kind, tmp_path, own_cache):
     sky = np.random.default_rng(5).uniform(0.1, 2, (16, 32, 3)).astype(np.float32)
-    scene = envedit.load_scene("sphere", 16)
+    scene = envedit.load_scene("sphere", 16, parameters={"roughness": 0.4})
     picture = scene.render(np.roll(sky, 9, axis=1), spp=16)
     asked = {"spp": 8} | ({"kind": kind, "file": "array"} if kind == "rendering" else {})
-    settings = TINY | {"target": asked}
+    settings = TINY | {"target": asked, "representation": {"kind": "pixels"}}
     result = envedit.edit(settings, scene=scene, envmap=sky, target=picture, mask=np.ones((16, 16)))
     assert (result.metrics["painted"] is None) == (kind == "rendering")
     result.save(tmp_path / "out")
     found = config.load(tmp_path / "out" / "config.toml")
+    assert found.scene.parameters == {"roughness": 0.4}
     assert found.target.kind == kind and found.target.spp == 8
-    assert np.array_equal(pipeline.run(found).envmap, result.envmap)
+    again = pipeline.run(found)
+    assert np.array_equal(again.envmap, result.envmap) and again.given.size == (32, 16)
+    before = result.metrics["timing"]["total_s"], list(result.warnings)
+    result.save(tmp_path / "out")  # a second time: the first is moved aside, and the result is as it was
+    assert (tmp_path / "out" / "earlier-1" / "given_envmap.exr").exists()
+    assert (result.metrics["timing"]["total_s"], result.warnings) == before
 
 
 def test_a_plot_without_matplotlib_says_what_to_install(monkeypatch):
@@ -189,14 +174,11 @@ def test_a_built_scene_that_cannot_be_used_is_refused():
         (lambda: {"mask": np.ones((4, 4))}, ConfigError, ["mask: got one without a target"]),
         (lambda: {"target": np.ones(3), "target_map": np.ones(3)}, ConfigError, ["got both, expected one"]),
         (lambda: {"envmap": "sky.exr"}, InputError, ["envmap: got 'sky.exr', expected an array"]),
-        (lambda: {"envmap": [[1], [1, 2]]}, InputError, ["envmap: got [[1], [1, 2]], expected an array"]),
         (lambda: {"envmap": np.ones((8, 16))}, InputError, ["shape (8, 16)", "expected (H, 2 H, 3)"]),
         (lambda: {"envmap": np.ones((8, 8, 3))}, InputError, ["envmap: a lat-long map is 2:1"]),
         (lambda: {"envmap": np.full((8, 16, 3), np.nan)}, InputError, ["envmap: 128 texels are NaN"]),
-        (lambda: {"target_map": np.full((8, 16, 3), -np.inf)}, InputError, ["target_map: 128 texels are"]),
         (lambda: {"target": np.full((64, 64, 3), np.nan)}, InputError, ["target: pixel at row 0, column 0"]),
         (lambda: {"envmap": MASKED}, InputError, ["envmap: 3 values are masked", "fill them"]),
-        (lambda: {"target": np.ones((4, 4, 3))}, InputError, ["the picture has shape (4, 4, 3)"]),
         (lambda: {"scene": 3}, ConfigError, ["scene: got int, expected a file, a dict"]),
         (lambda: {"scene": "no_such.xml"}, InputError, ["no_such.xml: no such file"]),
         (lambda: {"scene": mi.load_dict({"type": "scene"})}, InputError, ["got environment none"]),
@@ -223,42 +205,24 @@ def test_codes_of_a_picture_as_radiance_are_warned_of():
     [
         (lambda: config.Config(scen={}), "scen: unknown key; did you mean scene?"),
         (lambda: config.Config(scene={"widht": 3}), "scene.widht: unknown key; did you mean width?"),
-        (lambda: config.Config(scene={"width": "a"}), "scene.width: got 'a'"),
         (lambda: config.Config(scene={3: 4}), "scene: got {3: 4}, expected a table"),
-        (lambda: config.Scene(size=3), "scene.size: unknown key; known: file, width"),
         (lambda: config.Scene("a", file="b"), "scene.file: got two values, expected one"),
         (lambda: config.Lights(1, 2, 3), "Lights: got 3 values, expected at most 2"),
-        (lambda: config.Config({"seed": 3}), "preset: got {'seed': 3}"),
         (lambda: config.from_dict(3), "config.toml: got 3, expected a table of tables"),
-    ],
-)
-def test_tables_made_in_python_name_the_key(make, text):
-    with pytest.raises(ConfigError) as info:
-        make()
-    assert text in str(info.value)
-
-
-@pytest.mark.parametrize(
-    ("make", "text"),
-    [
         (lambda: envedit.fit(np.ones((8, 16))), "image: got an array of shape (8, 16), expected (H, W, 3)"),
         (lambda: envedit.fit(MASKED), "image: 3 values are masked"),
         (lambda: envedit.load_scene("sphere", 8).render(MASKED, 1), "map: 3 values are masked"),
-        (lambda: envedit.fit("sky.exr"), "image: got 'sky.exr', expected an array"),
         (lambda: envedit.fit(np.ones((8, 16, 3)), {"hiden": 3}), "hiden: unknown key; did you mean hidden?"),
         (lambda: envedit.fit(np.ones((8, 16, 3)), settings={"epochs": -1}), "fit.epochs: got -1, expected"),
-        (lambda: envedit.fit(-np.ones((8, 16, 3))), "row 0, column 0 is not finite or is negative"),
         (lambda: envedit.load_scene("sphere", width="a"), "scene.width: got 'a', expected an integer"),
         (lambda: envedit.load_scene("sphere", parameters={"a": []}), "scene.parameters: got {'a': []}"),
-        (lambda: envedit.load_scene("shpere"), "did you mean sphere?"),
         (lambda: envedit.load_map("none.exr"), "none.exr"),
         (lambda: envedit.sunsky(63), "input.width: got 63, expected an even integer"),
         (lambda: envedit.LightTransport.build("sphere", spp="many"), "renderer.spp: got 'many', expected"),
-        (lambda: envedit.LightTransport.build("sphere", max_depth=0), "renderer.max_depth: got 0, expected"),
         (lambda: envedit.LightTransport.build(3), "scene: got int, expected a file, a dict"),
     ],
 )
-def test_other_functions_refuse_by_name_as_well(make, text):
+def test_tables_and_other_functions_refuse_by_name_as_well(make, text):
     with pytest.raises(envedit.EnveditError) as info:
         make()
     assert text in str(info.value)
@@ -269,10 +233,6 @@ def test_a_fit_takes_dicts():
     sky = envedit.sunsky(16)
     fitted = envedit.fit(sky, {"hidden": 8, "depth": 1}, {"epochs": 2, "cache": False})
     assert fitted.epochs == 2 and all(np.isfinite(values).all() for values in fitted.params.values())
-
-
-def test_a_dict_makes_a_table():
-    assert config.Config(scene={"width": 9}) == config.Config(scene=config.Scene(width=9))
 
 
 # ---- the public surface ------------------------------------------------------------------------------------

@@ -15,23 +15,7 @@ from tests.oracles.builders import BALL, LIGHT, SENSOR, write_scene
 
 HERE = Calibration(budget.REFERENCE_RENDER, 1.0, 0.0, 512)
 """The reference machine."""
-PAINTED = dataclasses.replace(HERE, painted=True)
 LARGE = dataclasses.replace(HERE, texels=2**25)
-
-
-def test_levels_grow_dearer_from_the_coarsest_to_the_finest():
-    times = [budget.expect(level, HERE) for level in LEVELS]
-    assert times == sorted(times) and times[0] > 0
-    assert [level.name for level in LEVELS].count("standard") == 1
-
-
-def test_the_standard_level_is_the_standard_preset_and_draft_s_the_draft():
-    for name in ("standard", "draft"):
-        level, preset = next(one for one in LEVELS if one.name == name), config.loads("", preset=name)
-        assert (level.map, level.film) == (preset.input.width, preset.scene.width)
-        assert level.spp == preset.target.spp
-        assert preset.target.spp == preset.output.spp
-    assert (level.render_db, level.map_db) != (0, 0), "what draft loses is measured"
 
 
 @pytest.mark.parametrize("elapsed", [0.0, 2.0])
@@ -54,18 +38,12 @@ def test_a_little_late_is_allowed_and_more_is_refused():
 
 
 @pytest.mark.parametrize(
-    "slower",
-    [
-        {"render": 4 * HERE.render},
-        {"machine": 4.0},
-        {"compile_s": 20.0},
-        {"quiet_spp": 768},
-    ],
-)
-def test_a_slower_machine_is_expected_to_take_longer(slower):
-    other = dataclasses.replace(HERE, **slower)
+    "more", [{"render": 4 * HERE.render}, {"machine": 4.0}, {"compile_s": 20.0}, {"quiet_spp": 768},
+             {"painted": True}]
+)  # fmt: skip
+def test_a_slower_machine_or_a_larger_task_is_expected_to_take_longer(more):
     standard = next(level for level in LEVELS if level.name == "standard")
-    assert budget.expect(standard, other) > 1.05 * budget.expect(standard, HERE)
+    assert budget.expect(standard, dataclasses.replace(HERE, **more)) > 1.05 * budget.expect(standard, HERE)
     assert budget.expect(standard, LARGE) > budget.expect(standard, HERE) + 5
 
 
@@ -82,23 +60,22 @@ def test_what_is_no_time_is_refused(text):
         run_options.seconds(text)
 
 
-@pytest.mark.parametrize("table", [{"representation": {"kind": "pixels"}}, {"renderer": {"kind": "path"}}])
-def test_only_what_times_are_known_of_is_budgeted(table):
-    with pytest.raises(ConfigError, match="--budget: got .*expected .*layers.*transport"):
-        budget.apply(config.from_dict(table), 60)
+STROKE = {"type": "light", "ellipse": [9, 9, 4, 4], "units": "pixels"}
 
 
 @pytest.mark.parametrize(
-    "target",
+    "table, says",
     [
-        {"kind": "image", "file": "a.png"},
-        {"mask": "a.png"},
-        {"kind": "strokes", "strokes": [{"type": "light", "ellipse": [9, 9, 4, 4], "units": "pixels"}]},
+        ({"representation": {"kind": "pixels"}}, "got .*expected .*layers.*transport"),
+        ({"renderer": {"kind": "path"}}, "got .*expected .*layers.*transport"),
+        ({"target": {"kind": "image", "file": "a.png"}}, "target.* is in pixels of the rendering"),
+        ({"target": {"mask": "a.png"}}, "target.* is in pixels of the rendering"),
+        ({"target": {"kind": "strokes", "strokes": [STROKE]}}, "target.* is in pixels of the rendering"),
     ],
 )
-def test_what_is_given_in_pixels_of_the_rendering_is_not_budgeted(target):
-    with pytest.raises(ConfigError, match="--budget: target.* is in pixels of the rendering"):
-        budget.apply(config.from_dict({"target": target}), 60)
+def test_what_times_are_not_known_of_or_is_in_pixels_is_not_budgeted(table, says):
+    with pytest.raises(ConfigError, match=f"--budget: {says}"):
+        budget.apply(config.from_dict(table), 60)
 
 
 @pytest.mark.parametrize("rows, wanted", [([0, 20], (0, 5)), ([0, 127], (0, 31)), ([127, 127], (31, 31))])
@@ -111,7 +88,6 @@ def test_active_rows_stay_the_same_part_of_the_sky(rows, wanted):
 def test_a_picture_keeps_its_shape():
     assert budget._film_at(config.Scene(width=256, height=64), 128) == config.Scene(width=128, height=32)
     assert budget._film_at(config.Scene(width=256, height=4), 32).height == 1
-    assert budget._film_at(config.Scene(width=256), 64) == config.Scene(width=64)
 
 
 @pytest.fixture
@@ -133,17 +109,6 @@ def test_calibration_measures_this_scene(small):
     assert scene.QUIET_LEAST <= found.quiet_spp <= scene.QUIET_MOST
 
 
-def test_paint_takes_longer_to_search():
-    level = budget.LEVELS[-1]
-    more = budget.expect(level, PAINTED) - budget.expect(level, HERE)
-    assert more == pytest.approx(
-        (budget.PAINTED_FACTOR - 1) * level.traced_s * HERE.render / budget.REFERENCE_RENDER
-    )
-    between = (budget.expect(level, HERE) + budget.expect(level, PAINTED)) / 2
-    assert budget.choose(HERE, between, 0.0)[0] == level
-    assert budget.choose(PAINTED, between, 0.0)[0] != level
-
-
 @pytest.mark.slow
 def test_a_run_within_a_budget_takes_the_level_and_says_so(small, monkeypatch, capsys):
     tiny = LEVELS[0]._replace(name="tiny", map=32, film=24, spp=16)
@@ -153,10 +118,7 @@ def test_a_run_within_a_budget_takes_the_level_and_says_so(small, monkeypatch, c
     done = config.load(out / "config.toml")
     assert (done.input.width, done.scene.width) == (32, 24)
     assert done.target.spp == done.output.spp == 16 and done.optimizer.lr == 0.01
-    said = capsys.readouterr().out
-    assert "budget of 600 s: level 'tiny', map 32 and picture 24 across, 16 samples a pixel" in said
-    assert "; 3.6 dB less of rendering and 1.9 dB less of map than the standard preset, on average" in said
-    assert "level 'tiny'" in (out / "metrics.json").read_text()
+    assert "level 'tiny'" in capsys.readouterr().out and "level 'tiny'" in (out / "metrics.json").read_text()
 
 
 @pytest.mark.slow

@@ -8,21 +8,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from envedit.cli import doctor, run
+from envedit.cli import run
 from envedit.images import images
 from tests.oracles import ROOT
-from tests.oracles.builders import LIGHT, SENSOR, exr, sky, write_scene
+from tests.oracles.builders import exr, sky
 from tests.oracles.runs import call, changed, names, pixels, world
-
-ENSURE = doctor.ensure
-
 
 pytestmark = pytest.mark.usefixtures("isolated")
 
 
 @pytest.fixture
 def path(tmp_path, rng):
-    """Return a configuration that would run."""
     return world(tmp_path, rng)
 
 
@@ -44,36 +40,17 @@ def fails(code, capsys, path, *arguments):
 # ---- configuration and usage: 2 --------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("text", "says"),
-    [
-        ("[fit]\nepoch = 3", ["[fit]", "epoch", "did you mean epochs"]),
-        ('[fit]\nepochs = "many"', ["fit.epochs", "'many'", "integer"]),
-        ("[input]\nwidth = 16\nrows = [3, 8]", ["input.rows", "[3, 8]"]),
-        ("[fit]\nepochs = 3\nepochs = 4", ["not TOML", "line 3"]),
-    ],
-)
-def test_a_configuration_that_cannot_be_understood(text, says, tmp_path, capsys):
+def test_a_configuration_that_cannot_be_understood_or_is_not_there(tmp_path, capsys):
     file = tmp_path / "c.toml"
-    file.write_text(text)
-    said = fails(2, capsys, file)
-    assert all(words in said for words in says), said
-
-
-def test_a_configuration_that_is_not_there(tmp_path, capsys):
+    for text, says in (("[fit]\nepoch = 3", "did you mean epochs"), ("a = 3\na = 4", "not TOML")):
+        file.write_text(text)
+        assert says in fails(2, capsys, file)
     assert "none.toml: no such configuration file" in fails(2, capsys, tmp_path / "none.toml")
     assert "a folder" in fails(2, capsys, tmp_path)
 
 
 @pytest.mark.parametrize(
-    ("arguments", "says"),
-    [
-        ([], "CONFIG.toml"),
-        (["c.toml", "--nonsense"], "--nonsense"),
-        (["c.toml", "--preset", "best"], "best"),
-        (["c.toml", "--out"], "--out"),
-        (["c.toml", "d.toml"], "d.toml"),
-    ],
+    ("arguments", "says"), [([], "CONFIG.toml"), (["c.toml", "--preset", "best"], "best")]
 )
 def test_a_bad_command_line(arguments, says, capsys):
     with pytest.raises(SystemExit) as stop:
@@ -83,11 +60,17 @@ def test_a_bad_command_line(arguments, says, capsys):
     assert "usage:" in err and says in err.splitlines()[-1] and "Traceback" not in err
 
 
-@pytest.mark.parametrize("name", ["a.jpg", "a", ".exr", "a.exr.tif"])
-def test_an_export_of_another_kind(name, path, capsys, tmp_path):
-    said = fails(2, capsys, path, "--export-initial", tmp_path / name)
-    assert "--export-initial" in said and ".exr or .png" in said
-    assert not (tmp_path / name).exists()
+def test_an_export_is_a_picture_that_is_not_there(path, capsys, tmp_path):
+    export = "--export-initial"
+    assert ".exr or .png" in fails(2, capsys, path, export, tmp_path / "a.jpg")
+    assert not (tmp_path / "a.jpg").exists()
+    before = (tmp_path / "map.exr").read_bytes()
+    said = fails(3, capsys, path, export, tmp_path / "map.exr")
+    assert str(tmp_path / "map.exr") in said and (tmp_path / "map.exr").read_bytes() == before
+    (tmp_path / "link.png").symlink_to(tmp_path / "nowhere.png")
+    assert "link.png" in fails(3, capsys, path, export, tmp_path / "link.png")
+    assert not (tmp_path / "nowhere.png").exists()
+    assert "folder" in fails(3, capsys, path, export, tmp_path / "none" / "a.png")
 
 
 def test_an_export_does_not_resume(path, capsys, tmp_path):
@@ -115,10 +98,9 @@ def test_a_png_as_map_is_taken_with_a_warning(path, capsys, tmp_path, rng):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_texels_that_are_not_finite(value, path, capsys, tmp_path, rng):
+def test_texels_that_are_not_finite(path, capsys, tmp_path, rng):
     picture = sky(rng) + 0.1
-    picture[3, 7, 1] = picture[6, 2, 0] = value
+    picture[3, 7, 1] = picture[6, 2, 0] = np.nan
     exr(tmp_path / "map.exr", **{c: picture[..., i].copy() for i, c in enumerate("RGB")})
     said = fails(3, capsys, path)
     assert "map.exr" in said and "row 3, column 7" in said and "2 texels" in said and "repair" in said
@@ -131,22 +113,11 @@ def test_texels_that_are_not_finite(value, path, capsys, tmp_path, rng):
     assert edited[4:][good[4:]].tobytes() == picture[4:][good[4:]].tobytes()
 
 
-@pytest.mark.slow
-def test_a_scene_that_sees_no_light(path, capsys, tmp_path):
-    inside = '<shape type="sphere"><float name="radius" value="50"/></shape>'
-    write_scene(tmp_path, SENSOR, inside, LIGHT, name="scene.xml")
-    said = fails(3, capsys, path)
-    assert "scene.xml" in said and "no pixel receives light" in said
-
-
 @pytest.mark.parametrize(
     ("target", "says"),
     [
         ({"file": "none.exr"}, ["none.exr"]),
-        ({"kind": "image", "file": "none.exr"}, ["none.exr"]),
         ({"kind": "image", "file": "map.exr"}, ["map.exr", "16x8", "24x18"]),
-        ({"kind": "image", "file": "nan.exr"}, ["nan.exr", "row 2, column 5"]),
-        ({"kind": "image", "file": "good.exr", "mask": "map.exr"}, ["map.exr", "16x8"]),
         ({"kind": "image", "file": "good.exr", "mask": "black.png"}, ["black.png"]),
         ({"kind": "image", "file": "good.exr", "mask": "none.png"}, ["none.png"]),
     ],
@@ -155,44 +126,19 @@ def test_a_target_that_cannot_be_used(target, says, path, capsys, tmp_path):
     good = np.full((18, 24, 3), 0.5, np.float32)
     images.write_exr(tmp_path / "good.exr", good)
     images.write_png(tmp_path / "black.png", 0 * good)
-    good[2, 5] = np.nan
-    exr(tmp_path / "nan.exr", **{c: good[..., i].copy() for i, c in enumerate("RGB")})
     said = fails(3, capsys, path, *changed(**{f"target__{key}": value for key, value in target.items()}))
     assert all(words in said for words in says), said
 
 
-def test_a_file_in_place_of_the_output_folder(path, capsys, tmp_path):
+def test_an_output_folder_that_cannot_be_made_or_written_to(path, capsys, tmp_path):
     (tmp_path / "c_out").write_text("mine")
-    said = fails(3, capsys, path)
-    assert str(tmp_path / "c_out") in said and "--out" in said
+    (tmp_path / "locked").mkdir(mode=0o555)
+    folders = [tmp_path / "c_out", tmp_path / "c_out" / "results", Path("/proc/results")]
+    folders += [tmp_path / "locked"] * (getattr(os, "geteuid", int)() != 0)  # permissions do not bind root
+    for folder in folders:
+        said = fails(3, capsys, path, "--out", str(folder))
+        assert str(folder) in said and "--out" in said
     assert (tmp_path / "c_out").read_text() == "mine"
-
-
-def test_an_output_folder_that_cannot_be_made(path, capsys, tmp_path):
-    (tmp_path / "file").write_text("mine")
-    for folder in (tmp_path / "file" / "results", Path(os.devnull) / "results", Path("/proc/results")):
-        if folder.parent.exists():
-            said = fails(3, capsys, path, "--out", str(folder))
-            assert str(folder) in said and "--out" in said
-
-
-@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="permissions do not bind root")
-def test_an_output_folder_that_is_read_only(path, capsys, tmp_path):
-    folder = tmp_path / "locked"
-    folder.mkdir(mode=0o555)
-    said = fails(3, capsys, path, "--out", str(folder))
-    assert str(folder) in said and "--out" in said
-
-
-def test_an_export_overwrites_nothing(path, capsys, tmp_path):
-    map_before = (tmp_path / "map.exr").read_bytes()
-    said = fails(3, capsys, path, "--export-initial", tmp_path / "map.exr")
-    assert str(tmp_path / "map.exr") in said and "not overwritten" in said
-    assert (tmp_path / "map.exr").read_bytes() == map_before
-    (tmp_path / "link.png").symlink_to(tmp_path / "nowhere.png")
-    assert "link.png" in fails(3, capsys, path, "--export-initial", tmp_path / "link.png")
-    assert "folder" in fails(3, capsys, path, "--export-initial", tmp_path / "none" / "a.png")
-    assert not (tmp_path / "nowhere.png").exists()
 
 
 # ---- the machine: 4 --------------------------------------------------------------------------------------
@@ -211,12 +157,3 @@ def test_a_machine_without_llvm(path, tmp_path):
     assert len(lines) <= 2 and lines[0].startswith("envedit: ")
     assert "DRJIT_LIBLLVM_PATH=/nonexistent" in lines[0] and "libllvm19" in found.stderr
     assert not names(tmp_path / "c_out")
-
-
-@pytest.mark.slow
-def test_a_machine_without_a_gpu(path, capsys, monkeypatch):
-    monkeypatch.setattr(doctor, "ensure", ENSURE)
-    if doctor.check("cuda_ad_rgb").ok:
-        pytest.skip("this machine has a GPU")
-    said = fails(4, capsys, path, *changed(variant="cuda_ad_rgb"))
-    assert "cuda_ad_rgb" in said and "llvm_ad_rgb" in said

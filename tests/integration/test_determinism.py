@@ -34,7 +34,6 @@ def carried_out(tmp_path, monkeypatch, threads):
 
 
 def error(one, other):
-    """Return the largest relative difference of the edited maps."""
     a, b = (pixels(folder / "edited.exr").astype(np.float64) for folder in (one, other))
     return float((np.abs(a - b) / np.maximum(a, 1e-3)).max())
 
@@ -55,6 +54,7 @@ def test_the_same_files_on_any_number_of_threads(kind, renderer, tmp_path, rng, 
     warm = carried_out(path, 2, cache=tmp_path / "cache-1")  # fit and recording come from disk
     assert differing(one, two) == set() == differing(one, warm)
     assert pixels(one / "edited.exr").tobytes() != pixels(tmp_path / "map.exr").tobytes()
+    assert (one / "influence.exr").exists() == (renderer == "transport")
 
 
 def test_a_wide_pixel_filter_and_odd_numbers_of_samples_give_the_same_files(tmp_path, rng, carried_out):

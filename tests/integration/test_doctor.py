@@ -53,22 +53,12 @@ def test_a_library_that_cannot_run_it(version, says, monkeypatch, cache):
     assert not cache.exists()  # a failure is never remembered
 
 
-def test_cuda_without_a_gpu(healthy):
-    found = doctor.check("cuda_ad_rgb")
+@pytest.mark.parametrize("variant", ["cuda_ad_rgb", "metal_ad_rgb", "scalar_rgb"])
+def test_a_variant_that_does_not_run_here(variant):
+    found = doctor.check(variant)
     if found.ok:
-        pytest.skip("this machine has a GPU")
-    assert "NVIDIA" in found.lines[0] and "llvm_ad_rgb" in found.lines[1]
-
-
-def test_metal_where_mitsuba_has_no_such_variant():
-    found = doctor.check("metal_ad_rgb")
-    if found.ok:
-        pytest.skip("this machine has an Apple GPU")
-    assert "Apple GPU" in found.lines[0] and "llvm_ad_rgb" in found.lines[1] and len(found.lines) == 2
-
-
-def test_a_variant_envedit_does_not_know():
-    assert "does not run on variant 'scalar_rgb'" in doctor.check("scalar_rgb").lines[0]
+        pytest.skip("this machine has such a GPU")
+    assert len(found.lines) == 2 and variant in found.lines[0] and "llvm_ad_rgb" in found.lines[1]
 
 
 @pytest.mark.slow
@@ -81,8 +71,7 @@ def test_the_command_prints_versions_and_returns_the_exit_code(monkeypatch):
 
 def test_main_reports_a_healthy_machine(monkeypatch, capsys, healthy):
     monkeypatch.setattr(doctor, "check", lambda variant: healthy)
-    assert doctor.main([]) == 0
-    assert "llvm_ad_rgb: ready" in capsys.readouterr().out
+    assert doctor.main([]) == 0 and "llvm_ad_rgb" in capsys.readouterr().out
 
 
 # ---- the memory of a success -------------------------------------------------------------------------------
@@ -135,22 +124,18 @@ def test_a_cache_that_cannot_be_written_is_no_error(monkeypatch, cache, tmp_path
     assert len(calls) == 2
 
 
-# ---- wording of what cannot be provoked here ---------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     "code, said, says",
     [
-        (-6, "LLVM ERROR: Cannot select: f32 = fminimum", "at the first rendering (SIGABRT: LLVM ERROR"),
-        (-11, "", "SIGSEGV"),
+        (-6, "LLVM ERROR: Cannot select", "SIGABRT: LLVM ERROR"),
+        (-99, "", "exit code -99"),
         (None, "", "did not end in"),
         (1, "ImportError: ... because the LLVM shared library", "no LLVM library was found"),
         (1, "Traceback\nValueError: odd", "ValueError: odd"),
         (1, "", "it said nothing"),
-        (-99, "", "exit code -99"),
     ],
 )
-def test_every_end_of_the_child_has_two_lines(monkeypatch, code, said, says):
+def test_how_the_child_ended_is_told_on_one_line_and_what_to_do_on_another(code, said, says, monkeypatch):
     monkeypatch.delenv("DRJIT_LIBLLVM_PATH", raising=False)
     cause, remedy = doctor._explain("llvm_ad_rgb", code, said, {})
     assert says in cause and remedy and "\n" not in cause + remedy

@@ -138,21 +138,15 @@ def test_radiance_files_hold_every_exponent_to_a_256th(width, tmp_path, rng):
         images.write_hdr(tmp_path / "b.hdr", np.full((3, 6, 3), np.nan))
 
 
-@pytest.mark.parametrize("value, cut", [(65504, False), (1e6, True)])
-def test_half_is_cut_at_its_largest_and_says_so(value, cut, tmp_path, rng):
+def test_half_is_cut_at_its_largest_and_says_so(tmp_path, rng):
     image = sky(rng)
-    image[2, 3] = value
-    said = map_files.write_map(
-        config.Output(half=True),
-        tmp_path / "edited",
-        image,
-        inputs.InputMap("a.hdr", image, 1.0, (16, 8), []),
+    image[2, 3] = 1e6
+    given = inputs.InputMap("a.hdr", image, 1.0, (16, 8), [])
+    said = map_files.write_map(config.Output(half=True), tmp_path / "edited", image, given)
+    np.testing.assert_allclose(
+        pixels(tmp_path / "edited.exr"), np.minimum(image, 65504), rtol=2**-11, atol=1e-7
     )
-    with OpenEXR.File(str(tmp_path / "edited.exr"), separate_channels=True) as file:
-        assert file.channels()["R"].pixels.dtype == np.float16
-    found = pixels(tmp_path / "edited.exr")
-    np.testing.assert_allclose(found, np.minimum(image, 65504), rtol=2**-11, atol=1e-7)
-    assert bool(said) == cut and (not cut or "1 texels are brighter than 65504" in said[0])
+    assert "1 texels are brighter than 65504" in said[0]
 
 
 @pytest.mark.slow

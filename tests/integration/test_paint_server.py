@@ -40,7 +40,6 @@ def server(tmp_path_factory):
 
 
 def shown(socket):
-    """Return the next picture of T E, (h, w, 3)."""
     while True:
         received = socket.recv(timeout=60)
         if isinstance(received, bytes) and received[4:6] == b"\0\0":

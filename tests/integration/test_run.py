@@ -19,11 +19,11 @@ import OpenEXR
 import pytest
 
 from envedit import config, pipeline
-from envedit.cli import run
+from envedit.cli.progress import Progress
 from envedit.core.color import tonemap
 from envedit.images import images
 from envedit.losses.perceptual import installed
-from envedit.solve import adam_loop, checkpoint
+from envedit.solve import adam_loop
 from envedit.transport.light_transport import LightTransport
 from tests.oracles import ROOT
 from tests.oracles.builders import read_png, sky
@@ -45,6 +45,9 @@ from tests.oracles.runs import (
 
 pytestmark = pytest.mark.usefixtures("isolated")
 
+PIXELS = {"representation": {"kind": "pixels"}}
+"""What is edited quickest."""
+
 
 @pytest.fixture(scope="module")
 def done(tmp_path_factory):
@@ -61,50 +64,32 @@ def done(tmp_path_factory):
 
 
 def test_exactly_the_promised_files_beside_the_configuration(done):
-    path, folder, out, _ = done
+    _, folder, out, err = done
     assert names(folder) == FILES | INFLUENCE
     assert all(line in out.splitlines() for line in measured(folder)["choices"])
     assert str(folder) in out and re.search(r"rendering [\d.]+ -> [\d.]+ dB, map [\d.]+ -> [\d.]+ dB", out)
+    assert "editing" in err.splitlines() and "editing" not in out.splitlines()
 
 
-def test_images_are_float32_of_the_right_size_and_finite(done):
+def test_pictures_and_metrics_are_finite(done):
     _, folder, _, _ = done
     for path in folder.glob("*.exr"):
         expected = (18, 24) if path.name.startswith("render") else (8, 16)
         with OpenEXR.File(str(path), separate_channels=True) as file:
             planes = {name: channel.pixels.copy() for name, channel in file.channels().items()}
-        beside = {f"{layer}.{c}" for layer in ("initial", "difference") for c in "RGB"} | {"influence.Y"}
-        assert set(planes) == set("RGB") | (beside if path.name == "edited_layers.exr" else set())
         for name, plane in planes.items():
             assert plane.dtype == np.float32 and plane.shape == expected
             assert np.isfinite(plane).all() and (name.startswith("difference") or (plane >= 0).all())
-
-
-def test_metrics_have_the_documented_keys_and_no_value_that_is_not_finite(done):
-    found = measured(done[1])
-    image_keys = {"psnr", "ssim", "mse", "lpips", "log_rmse", "beyond_display"}
-    assert set(found["render"]) == set(found["initial"]) == set(found["envmap"]) == image_keys
-    assert set(found["fit"]) == {"log_psnr", "peak_ratio", "epochs", "cached", "seconds"}
-    timing = {"import", "target", "fit", "transport", "reach", "start", "edit"}
-    timing |= {"solve", "judge", "full", "report", "total"}
-    assert set(found["timing"]) == {f"{part}_s" for part in timing} | {"per_iteration_ms"}
-    assert found["timing"]["start_s"] > 0 and found["timing"]["fit_s"] > 0
-    assert {"iterations", "non_finite_steps", "tonemap", "active_rows", "choices"} <= set(found)
-    traced = found["transport"]
-    assert set(traced) == {
-        "cached", "entries", "memory_bytes", "columns", "path_depth", "depth_error", "samples",
-        "predicted_error", "frozen",
-    }  # fmt: skip
-    assert traced["cached"] is False and traced["path_depth"] == 3 and traced["samples"] == 32
-    assert 0 <= traced["depth_error"] < 0.1 and 0 < traced["predicted_error"] < 1 and traced["frozen"] == 0
-    # At least the packed entries, 16 bytes each, in both directions.
-    assert traced["memory_bytes"] >= 32 * traced["entries"] > 0
-    assert found["iterations"] == 4 and found["non_finite_steps"] == 0
-    assert found["tonemap"] == "clip(E, 0, 1)^(1/2.2)" and found["active_rows"] == [0, 3]
+    found = measured(folder)
+    assert found["iterations"] == 4 and found["non_finite_steps"] == 0 and found["active_rows"] == [0, 3]
     assert found["fit"]["epochs"] == 4 and found["fit"]["cached"] is False
     assert all(math.isfinite(number) for number in numbers(found))
-    parts = [value for key, value in found["timing"].items() if key not in ("total_s", "per_iteration_ms")]
-    assert min(parts) >= 0 and found["timing"]["total_s"] >= 0.99 * max(parts)
+    traced, times = found["transport"], found["timing"]
+    # At least the packed entries, 16 bytes each, in both directions.
+    assert traced["memory_bytes"] >= 32 * traced["entries"] > 0 and traced["cached"] is False
+    assert 0 <= traced["depth_error"] < 0.1 and 0 < traced["predicted_error"] < 1
+    parts = [value for key, value in times.items() if key not in ("total_s", "per_iteration_ms")]
+    assert min(parts) >= 0 and times["total_s"] >= 0.99 * max(parts)
 
 
 def test_metrics_are_those_of_the_written_pictures(done):
@@ -126,7 +111,7 @@ def test_metrics_are_those_of_the_written_pictures(done):
 @pytest.mark.slow
 def test_the_map_is_measured_on_its_active_rows_against_the_one_that_was_turned(tmp_path, rng):
     """90 degrees are a quarter of the columns, so that turning is exact whatever its sense."""
-    path = world(tmp_path, rng, target={"rotate_degrees": 90.0})
+    path = world(tmp_path, rng, **PIXELS, target={"rotate_degrees": 90.0})
     assert call(path, "--quiet") == 0
     found, start = measured(tmp_path / "c_out"), pixels(tmp_path / "map.exr")
     edited = pixels(tmp_path / "c_out" / "edited.exr")
@@ -152,30 +137,21 @@ def test_the_resolved_configuration_loads_back_to_the_same_one(done):
     assert config.load(folder / "config.toml") == installed.settled(config.load(path))
 
 
-def test_the_manifest_names_inputs_versions_and_seed(done):
+def test_the_manifest_names_inputs_and_seed(done):
     path, folder, _, _ = done
     found = json.loads((folder / "manifest.json").read_text(), parse_constant=no_constant)
     for role, name in (("envmap", "map.exr"), ("scene", "scene.xml")):
         given = found["inputs"][role]
         assert given["path"] == str(path.parent / name)
         assert given["sha256"] == hashlib.sha256((path.parent / name).read_bytes()).hexdigest()
-    assert {"envedit", "python", "mitsuba", "drjit", "numpy", "OpenEXR"} <= found["versions"].keys()
-    assert None not in found["versions"].values() and "commit" in found
-    assert found["seeds"] == {"seed": 0} and found["variant"] == "llvm_ad_rgb" and found["llvm"]["version"]
-
-
-def test_rows_that_are_not_active_come_back_bit_for_bit(done):
-    path, folder, _, _ = done
-    before, after = pixels(path.parent / "map.exr"), pixels(folder / "edited.exr")
-    assert after[4:].tobytes() == before[4:].tobytes()
-    assert (after[:4] != before[:4]).any()
+    assert found["seeds"] == {"seed": 0} and found["variant"] == "llvm_ad_rgb"
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("rows, active", [("all", [0, 7]), ([2, 2], [2, 2])])
 def test_only_the_rows_asked_for_change(rows, active, tmp_path, rng):
     adam = {"kind": "adam", "iterations": 4}  # Gauss-Newton leaves a row be that changes nothing but noise
-    path = world(tmp_path, rng, input={"envmap": "map.exr", "rows": rows}, optimizer=adam)
+    path = world(tmp_path, rng, **PIXELS, input={"envmap": "map.exr", "rows": rows}, optimizer=adam)
     assert call(path, "--quiet") == 0
     before, after = pixels(tmp_path / "map.exr"), pixels(tmp_path / "c_out" / "edited.exr")
     first, last = measured(tmp_path / "c_out")["active_rows"]
@@ -199,7 +175,7 @@ def test_preview_and_report_are_whole(done):
 
 @pytest.mark.slow
 def test_without_a_report_neither_page_nor_preview_is_written(tmp_path, rng):
-    path = world(tmp_path, rng, output={"report": False})
+    path = world(tmp_path, rng, **PIXELS, output={"report": False})
     assert call(path, "--quiet") == 0
     assert names(tmp_path / "c_out") == FILES - {"preview.png", "report.html"} | INFLUENCE
 
@@ -229,45 +205,6 @@ def test_the_judged_rendering_is_what_mitsuba_makes_of_the_written_file(tmp_path
     assert np.sqrt(np.mean((a - b) ** 2)) < 0.03 * b.mean()
     assert final.mean() == pytest.approx(direct.mean(), rel=0.02)
     assert pixels(out / "edited.exr")[:4].mean() < 0.9 * pixels(tmp_path / "map.exr")[:4].mean()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("kind", "renderer"),
-    [*((kind, "transport") for kind in ("layers", "siren", "pixels", "log-pixels")), ("siren", "path")],
-)
-def test_every_representation_runs(kind, renderer, tmp_path, rng):
-    path = world(tmp_path, rng)
-    settings = changed(representation__kind=kind, renderer__kind=renderer, optimizer__iterations=2)
-    assert call(path, "--quiet", *settings) == 0
-    found = measured(tmp_path / "c_out")
-    assert found["iterations"] == 2 and found["non_finite_steps"] == 0
-    assert (found["fit"] is None) == (kind != "siren")
-    assert names(tmp_path / "c_out") & INFLUENCE == (INFLUENCE if renderer == "transport" else set())
-    assert (found["transport"] is None) == (renderer == "path") and found["choices"]
-
-
-@pytest.mark.slow
-def test_a_painted_target_has_no_known_map(tmp_path, rng):
-    path = world(tmp_path, rng, target={"kind": "image", "file": "painted.exr", "mask": "mask.png"})
-    images.write_exr(tmp_path / "painted.exr", np.full((18, 24, 3), 0.5, np.float32))
-    images.write_png(tmp_path / "mask.png", np.ones((18, 24, 3)))
-    assert call(path, "--quiet") == 0
-    out = tmp_path / "c_out"
-    found = measured(out)
-    assert found["envmap"] is None and found["render"]["psnr"] > 0
-    assert (pixels(out / "render_target.exr") == 0.5).all()
-    inputs = json.loads((out / "manifest.json").read_text())["inputs"]
-    assert set(inputs) == {"envmap", "scene", "target", "mask"}
-
-
-@pytest.mark.slow
-def test_the_shipped_sky_and_scene_need_no_files(tmp_path, rng):
-    path = world(tmp_path, rng, input={"envmap": "sunsky", "width": 16}, scene={"file": "matte"})
-    assert call(path, "--quiet", *changed(optimizer__iterations=1)) == 0
-    inputs = json.loads((tmp_path / "c_out" / "manifest.json").read_text())["inputs"]
-    shipped = next(p for p in (ROOT / "scenes", ROOT / "envedit" / "scenes") if p.is_dir()) / "matte.xml"
-    assert inputs["scene"]["sha256"] == hashlib.sha256(shipped.read_bytes()).hexdigest()
 
 
 @pytest.mark.slow
@@ -323,7 +260,7 @@ def test_paint_that_a_result_is_farther_from_is_a_warning(tmp_path, rng, capsys)
     path = world(tmp_path, rng, target={"kind": "strokes", "strokes": [stroke]}, output={"exposure": -3.0})
     assert call(path, "--quiet", "--out", tmp_path / "out") == 0
     said = capsys.readouterr().err
-    assert "the result is farther from the target than the input where painted: " in said
+    assert "the result is farther from the target than the input: -" in said
     assert measured(tmp_path / "out")["worse"] is True
 
 
@@ -367,50 +304,25 @@ def test_quiet_prints_nothing(tmp_path, rng, capsys):
     assert capsys.readouterr() == ("", "")
 
 
-def test_progress_goes_to_stderr_and_results_to_stdout(done):
-    _, folder, out, err = done
-    stages = ["loading", "rendering the target", "tracing light transport", "fitting (siren)", "editing",
-              "rendering the result", "writing"]  # fmt: skip
-    assert [line for line in err.splitlines() if line in stages] == stages
-    assert "lights" not in err
-    assert not set(out.splitlines()) & set(stages) and out.splitlines()[-1] == f"results in {folder}"
-
-
 @pytest.mark.slow
-def test_layers_are_separated_and_searched_for_not_fitted(tmp_path, rng, capsys):
-    assert call(world(tmp_path, rng)) == 0
-    err = capsys.readouterr().err
-    stages = ["loading", "rendering the target", "tracing light transport", "separating lights",
-              "searching for lights", "editing", "rendering the result", "writing"]  # fmt: skip
-    assert [line for line in err.splitlines() if line in stages] == stages and "fitting" not in err
-
-
-@pytest.mark.slow
-def test_presets_and_overrides_take_effect(tmp_path, rng, capsys):
-    path = world(tmp_path, rng)
-    out = tmp_path / "o"
-    assert call(path, "--preset", "draft", *changed(optimizer__iterations=3, seed=5), "--out", out) == 0
-    found = config.load(out / "config.toml")
-    standard = config.load(path)
-    assert found.preset == "draft" and found.seed == 5 and found.optimizer.iterations == 3
-    # The preset beats the defaults, the file beats the preset.
-    assert found == config.load(path, "draft", ["optimizer.iterations=3", "seed=5", f"output.dir={out}"])
-    assert standard.preset == "standard" and standard.seed == 0
-    assert found.target.spp == standard.target.spp == 16
-    assert measured(out)["iterations"] == len(rows_of(out)) == 3
-    assert json.loads((out / "manifest.json").read_text())["seeds"] == {"seed": 5}
+def test_presets_and_overrides_take_effect(tmp_path, rng):
+    path, overrides = world(tmp_path, rng, **PIXELS), ["optimizer.iterations=1", "seed=5"]
+    changes = [part for one in overrides for part in ("--set", one)]
+    assert call(path, "--quiet", "--preset", "draft", *changes) == 0
+    expected = config.load(path, "draft", [*overrides, f"output.dir={tmp_path / 'c_out'}"])
+    assert config.load(tmp_path / "c_out" / "config.toml") == expected != config.load(path)
 
 
 @pytest.mark.slow
 def test_out_may_have_any_name(tmp_path, rng):
-    path, name = world(tmp_path / "in", rng), 'é ü 😀 a"b back\\slash'
+    path, name = world(tmp_path / "in", rng, **PIXELS), 'é ü 😀 a"b back\\slash'
     assert call(path, "--quiet", "--out", tmp_path / name, *changed(optimizer__iterations=0)) == 0
     assert names(tmp_path) == {"in", name} and names(tmp_path / name) >= FILES
 
 
 @pytest.mark.slow
 def test_earlier_results_are_moved_and_never_lost(tmp_path, rng):
-    path, out = world(tmp_path, rng), tmp_path / "c_out"
+    path, out = world(tmp_path, rng, **PIXELS), tmp_path / "c_out"
     kept = []
     for seed in range(3):
         assert call(path, "--quiet", *changed(optimizer__iterations=1, seed=seed)) == 0
@@ -425,7 +337,7 @@ def test_earlier_results_are_moved_and_never_lost(tmp_path, rng):
 
 @pytest.mark.slow
 def test_the_written_configuration_runs_again_in_its_own_folder(tmp_path, rng):
-    path, out = world(tmp_path, rng, representation={"kind": "pixels"}), tmp_path / "c_out"
+    path, out = world(tmp_path, rng, **PIXELS), tmp_path / "c_out"
     assert call(path, "--quiet") == 0
     first = pixels(out / "edited.exr")
     assert call(out / "config.toml", "--quiet") == 0
@@ -435,7 +347,7 @@ def test_the_written_configuration_runs_again_in_its_own_folder(tmp_path, rng):
 
 @pytest.mark.slow
 def test_the_configuration_stays_where_a_run_that_fails_finds_it_again(tmp_path, rng, monkeypatch):
-    path, out = world(tmp_path, rng, representation={"kind": "pixels"}), tmp_path / "c_out"
+    path, out = world(tmp_path, rng, **PIXELS), tmp_path / "c_out"
     assert call(path, "--quiet") == 0
     with monkeypatch.context() as patch:
         patch.setattr(pipeline, "run", lambda *_, **__: (_ for _ in ()).throw(KeyboardInterrupt))
@@ -446,7 +358,7 @@ def test_the_configuration_stays_where_a_run_that_fails_finds_it_again(tmp_path,
 @pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="links")
 def test_an_input_is_not_moved_away_with_earlier_results_by_any_name(tmp_path, rng, capsys):
-    path, out = world(tmp_path, rng), tmp_path / "c_out"
+    path, out = world(tmp_path, rng, **PIXELS), tmp_path / "c_out"
     assert call(path, "--quiet") == 0
     before = content(out)
     (tmp_path / "link").symlink_to(out)
@@ -473,7 +385,7 @@ def test_a_finished_run_has_nothing_to_resume(done, capsys):
 
 @pytest.mark.slow
 def test_a_finished_run_whose_input_has_changed_is_not_complete(tmp_path, rng, capsys):
-    path, out = world(tmp_path, rng), tmp_path / "c_out"
+    path, out = world(tmp_path, rng, **PIXELS), tmp_path / "c_out"
     assert call(path, "--quiet", *changed(optimizer__iterations=1)) == 0
     before = content(out)
     named = Path(config.load(path).input.envmap)
@@ -489,7 +401,7 @@ def test_a_finished_run_whose_input_has_changed_is_not_complete(tmp_path, rng, c
 
 @pytest.mark.slow
 def test_a_configuration_in_its_own_folder_is_kept_by_a_first_run_that_resumes(tmp_path, rng):
-    path = world(tmp_path, rng)
+    path = world(tmp_path, rng, **PIXELS)
     written = path.read_bytes()
     path = path.rename(tmp_path / "config.toml")
     assert call(path, "--resume", "--quiet", "--out", tmp_path, *changed(optimizer__iterations=1)) == 0
@@ -502,21 +414,25 @@ def test_ctrl_c_inside_an_operation_is_ctrl_c(tmp_path, rng, capsys, monkeypatch
         raise KeyboardInterrupt
 
     monkeypatch.setattr(adam_loop._PlaceRows, "eval", press)
-    assert call(world(tmp_path, rng), "--quiet", *changed(optimizer__kind="adam")) == 130
+    assert call(world(tmp_path, rng, **PIXELS), "--quiet", *changed(optimizer__kind="adam")) == 130
     assert "interrupted" in capsys.readouterr().err
+
+
+def interrupting(during):
+    """Return what is called with the names of stages, and ends one as Ctrl-C does."""
+
+    def stage(self, text):
+        if text == during:
+            raise KeyboardInterrupt
+
+    return stage
 
 
 @pytest.mark.slow
 def test_a_changed_configuration_is_not_resumed(tmp_path, rng, capsys, monkeypatch):
-    path, out = world(tmp_path, rng, optimizer={"iterations": 4, "checkpoint_s": 0.0}), tmp_path / "c_out"
-    save = checkpoint.save
-
-    def save_and_interrupt(*arguments):
-        save(*arguments)
-        raise KeyboardInterrupt
-
+    path, out = world(tmp_path, rng, **PIXELS), tmp_path / "c_out"
     with monkeypatch.context() as patch:
-        patch.setattr(checkpoint, "save", save_and_interrupt)
+        patch.setattr(Progress, "stage", interrupting("writing"))
         assert call(path, "--quiet") == 130
     said = capsys.readouterr().err
     assert "--resume" in said and len(said.splitlines()) == 1
@@ -531,32 +447,17 @@ def test_a_changed_configuration_is_not_resumed(tmp_path, rng, capsys, monkeypat
 
 
 @pytest.mark.slow
-def test_an_interrupt_while_the_result_is_rendered_costs_no_iteration(tmp_path, rng, capsys, monkeypatch):
-    path, out = world(tmp_path, rng, representation={"kind": "pixels"}), tmp_path / "c_out"
+@pytest.mark.parametrize("during", ["rendering the result", "writing"])
+def test_an_interrupt_after_the_last_iteration_costs_none(during, tmp_path, rng, capsys, monkeypatch):
+    path, out = world(tmp_path, rng, **PIXELS), tmp_path / "c_out"
     assert call(path, "--quiet", "--out", tmp_path / "whole") == 0
-    from envedit.cli.progress import Progress
-
-    def stage(self, text):
-        if text == "rendering the result":
-            raise KeyboardInterrupt
-
     with monkeypatch.context() as patch:
-        patch.setattr(Progress, "stage", stage)
+        patch.setattr(Progress, "stage", interrupting(during))
         assert call(path, "--quiet") == 130
     assert "--resume" in capsys.readouterr().err and "checkpoint.npz" in names(out)
     monkeypatch.setattr(LightTransport, "render", lambda self, envmap, step: 1 / 0)
     assert call(path, "--quiet", "--resume") == 0
     assert pixels(out / "edited.exr").tobytes() == pixels(tmp_path / "whole" / "edited.exr").tobytes()
-
-
-@pytest.mark.slow
-def test_an_interrupt_while_results_are_written_names_the_checkpoint(tmp_path, rng, capsys, monkeypatch):
-    path = world(tmp_path, rng, representation={"kind": "pixels"})
-    with monkeypatch.context() as patch:
-        patch.setattr(run, "_write", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
-        assert call(path, "--quiet") == 130
-    assert "--resume" in capsys.readouterr().err
-    assert call(path, "--quiet", "--resume") == 0 and "metrics.json" in names(tmp_path / "c_out")
 
 
 def started(path, cache, *arguments):
@@ -583,8 +484,8 @@ def stop_at_checkpoint(process, file, number):
 @pytest.mark.skipif(os.name != "posix", reason="signals")
 def test_interrupted_and_killed_processes_resume_to_the_same_bits(tmp_path, rng):
     """Ctrl-C, then SIGKILL, each in a process of its own; the third process, this one, ends it."""
-    optimizer = {"iterations": 400, "checkpoint_s": 0.0}
-    path = world(tmp_path, rng, representation={"kind": "pixels"}, optimizer=optimizer)
+    optimizer = {"iterations": 150, "checkpoint_s": 0.0}
+    path = world(tmp_path, rng, **PIXELS, optimizer=optimizer)
     out = tmp_path / "c_out"
     code, said, errors = stop_at_checkpoint(started(path, tmp_path), out / "checkpoint.npz", signal.SIGINT)
     assert code == 130, errors
@@ -598,13 +499,13 @@ def test_interrupted_and_killed_processes_resume_to_the_same_bits(tmp_path, rng)
     assert code == -signal.SIGKILL and "checkpoint.npz" in names(out)
     with np.load(out / "checkpoint.npz") as stored:
         step = json.loads(stored["meta"].tobytes())["state"]["step"]
-    assert 0 < step < 400
+    assert 0 < step < 150
 
     assert call(path, "--quiet", "--resume") == 0
     assert call(path, "--quiet", "--out", tmp_path / "whole") == 0
     edited = pixels(out / "edited.exr")
     assert edited.tobytes() == pixels(tmp_path / "whole" / "edited.exr").tobytes() != so_far.tobytes()
-    assert names(out) == FILES | INFLUENCE and len(rows_of(out)) == 400
+    assert names(out) == FILES | INFLUENCE and len(rows_of(out)) == 150
 
 
 # ---- other commands --------------------------------------------------------------------------------------
@@ -646,6 +547,11 @@ def test_the_initial_rendering_is_exported_and_nothing_else(tmp_path, rng, capsy
     assert np.abs(read_png(tmp_path / "b.png") - expected).max() <= 1
 
 
+def test_the_export_says_how_the_file_is_named_in_a_configuration(tmp_path, rng, capsys):
+    assert call(world(tmp_path, rng), "--export-initial", tmp_path / "b.png") == 0
+    assert f'file = "{tmp_path / "b.png"}"' in capsys.readouterr().out
+
+
 def test_a_dry_run_writes_the_target_and_nothing_else(tmp_path, rng, capsys):
     stroke = {"type": "light", "rectangle": [0, 0, 0.5, 1], "amount": 0.25, "color": "#ffffff"}
     path = world(tmp_path, rng, target={"kind": "strokes", "strokes": [stroke]})
@@ -665,12 +571,3 @@ def test_a_dry_run_writes_the_target_and_nothing_else(tmp_path, rng, capsys):
     capsys.readouterr()
     assert call(path, *bare, "--set", "target.kind=none") == 2
     assert '--dry-run: got target.kind "none"' in capsys.readouterr().err
-
-
-def test_the_export_says_what_to_do_next(tmp_path, rng, capsys):
-    path = world(tmp_path, rng)
-    assert call(path, "--export-initial", tmp_path / "b.png") == 0
-    out, _ = capsys.readouterr()
-    assert "'gamma' would clip highlights" in out.splitlines()[0]
-    assert len(out.splitlines()) == 2 and "24x18, under the 'reinhard' tonemap" in out
-    assert f'[target] kind = "image", file = "{tmp_path / "b.png"}"' in out

@@ -8,6 +8,7 @@ import pytest
 
 from envedit.cli import run
 from envedit.core import latlong
+from envedit.core.errors import NumericalError
 from envedit.export import file_resolution
 from envedit.images import images
 from tests.oracles.builders import BALL, LIGHT, SENSOR, write_scene
@@ -17,11 +18,11 @@ from tests.oracles.runs import TINY, as_toml, merged
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("isolated")]
 
 WIDTH = 64
+PIXELS = {"representation": {"kind": "pixels"}}
 STROKE = {"type": "shadow", "rectangle": [0.3, 0.3, 0.7, 0.7], "amount": 0.5}
 
 
 def source(rng):
-    """Return a map of 64 x 32 with a sun."""
     picture = (0.5 + 0.05 * rng.random((WIDTH // 2, WIDTH, 3))).astype(np.float32)
     picture[6, 20:22] = 400
     return picture
@@ -51,35 +52,34 @@ def test_the_edit_is_carried_to_the_size_of_the_file(kind, tmp_path, rng):
 
 def test_a_sky_without_a_file_and_a_file_that_is_no_larger_have_no_full_map(tmp_path, rng):
     (tmp_path / "a").mkdir()
-    out = carried_out(tmp_path / "a", latlong.resize(source(rng), 8, 16))
+    out = carried_out(tmp_path / "a", latlong.resize(source(rng), 8, 16), **PIXELS)
     assert not (out / "edited_full.exr").exists() and (out / "edited_layers.exr").exists()
     (tmp_path / "b").mkdir()
-    out = carried_out(tmp_path / "b", source(rng), "--set", "output.full=false")
+    out = carried_out(tmp_path / "b", source(rng), "--set", "output.full=false", **PIXELS)
     assert not (out / "edited_full.exr").exists()
 
 
-def test_without_memory_for_the_full_map_the_rest_is_written(tmp_path, rng, monkeypatch, capsys):
-    def out_of_memory(*arguments):
-        raise MemoryError
-
-    monkeypatch.setattr(file_resolution, "at_full_resolution", out_of_memory)
-    out = carried_out(tmp_path, source(rng))
-    assert not (out / "edited_full.exr").exists() and (out / "metrics.json").exists()
-    assert "not enough memory" in capsys.readouterr().err
-
-
-def test_a_file_that_is_gone_by_the_end_costs_the_full_map_alone(tmp_path, rng, monkeypatch, capsys):
+@pytest.mark.parametrize(
+    ("error", "says"),
+    [
+        (MemoryError(), "not enough memory"),
+        (NumericalError("the carried map is not finite at row 3, column 4"), "row 3, column 4"),
+        (None, "map.exr"),
+    ],
+)
+def test_what_costs_the_full_map_costs_nothing_else(error, says, tmp_path, rng, monkeypatch, capsys):
     full = file_resolution.at_full_resolution
 
-    def gone(*arguments):
-        (tmp_path / "map.exr").unlink()
+    def fails(*arguments):
+        if error is not None:
+            raise error
+        (tmp_path / "map.exr").unlink()  # the file is gone by the end
         return full(*arguments)
 
-    monkeypatch.setattr(file_resolution, "at_full_resolution", gone)
-    out = carried_out(tmp_path, source(rng))
+    monkeypatch.setattr(file_resolution, "at_full_resolution", fails)
+    out = carried_out(tmp_path, source(rng), **PIXELS)
     assert not (out / "edited_full.exr").exists() and (out / "metrics.json").exists()
-    said = capsys.readouterr().err
-    assert "edited_full.exr is not written" in said and "map.exr" in said
+    assert says in capsys.readouterr().err
 
 
 def test_layers_are_the_maps_and_their_difference(tmp_path, rng):
@@ -95,7 +95,7 @@ def test_layers_are_the_maps_and_their_difference(tmp_path, rng):
 
 def test_strokes_are_carried_out_and_what_cannot_be_had_is_told(tmp_path, rng, capsys):
     target = {"kind": "strokes", "strokes": [STROKE]}
-    out = carried_out(tmp_path, source(rng), target=target)
+    out = carried_out(tmp_path, source(rng), target=target, **PIXELS)
     found = json.loads((out / "metrics.json").read_text())
     painted = found["painted"]
     assert set(painted) == {"towards", "elsewhere", "reachable"} and 0 <= painted["reachable"] <= 1
@@ -113,6 +113,6 @@ def test_less_than_half_within_reach_is_a_warning(tmp_path, rng, capsys):
         {"type": kind, "rectangle": [x, y, x + 1, y + 1], "units": "pixels", "amount": 1.0}
         for x in range(10, 14) for y in range(7, 11) for kind in ("light" if (x + y) % 2 else "shadow",)
     ]  # fmt: skip
-    out = carried_out(tmp_path, source(rng), target={"kind": "strokes", "strokes": strokes})
+    out = carried_out(tmp_path, source(rng), target={"kind": "strokes", "strokes": strokes}, **PIXELS)
     assert json.loads((out / "metrics.json").read_text())["painted"]["reachable"] < 0.5
     assert "is feasible under any map" in capsys.readouterr().err

@@ -217,17 +217,6 @@ def test_paint_that_one_factor_makes_leaves_lights(factor, transport):
     assert shown == pytest.approx(factor, rel=0.1)
 
 
-def test_what_is_raised_after_a_step_ends_the_search(transport):
-    image = sky(SUN)
-    problem, start = problem_of(transport, image, *painted(transport, image, sky((6, 40))))
-
-    def enough():
-        raise InterruptedError
-
-    with pytest.raises(InterruptedError):
-        search.search(problem, start, after_step=enough)
-
-
 def test_a_map_that_is_not_finite_has_no_explanation(transport):
     """The search returns it as it is; the steps refuse it."""
     image = sky(SUN)

@@ -7,7 +7,7 @@ import pytest
 
 from envedit.core.errors import InputError
 from envedit.scene import scene
-from envedit.transport import light_transport, recording
+from envedit.transport import recording
 from envedit.transport.light_transport import LightTransport
 from tests.oracles.builders import BALL, LIGHT, SENSOR, write_scene
 from tests.oracles.tiers import slow_but
@@ -16,8 +16,6 @@ LAMP = """<shape type="sphere"><point name="center" x="0" y="3" z="0"/><float na
     <emitter type="area"><rgb name="radiance" value="6, 3, 12"/></emitter></shape>"""
 GROUND = """<shape type="rectangle"><transform name="to_world"><rotate x="1" angle="-90"/><scale value="9"/>
     <translate y="-1"/></transform></shape>"""
-TURNED = """<emitter type="envmap"><string name="filename" value="none.exr"/>
-    <transform name="to_world"><rotate y="1" angle="30"/></transform></emitter>"""
 
 
 @pytest.fixture
@@ -92,27 +90,6 @@ def test_another_recording_is_not_taken_for_this_one(lit, tmp_path):
 
 
 @pytest.mark.slow
-def test_another_scene_is_not_taken_for_this_one(tmp_path):
-    """Colour, camera, film, turn of the emitter, a parameter of the scene: each makes its own recording."""
-    ball = BALL.replace("0.2, 0.4, 0.6", "$red, 0.4, 0.6")
-    parts = {
-        "first": (SENSOR, ball, LIGHT),
-        "camera": (SENSOR.replace("0,1,6", "0,2,6"), ball, LIGHT),
-        "film": (SENSOR.replace('"16"', '"20"'), ball, LIGHT),
-        "emitter": (SENSOR, ball, TURNED),
-        "object": (SENSOR, ball, BALL.replace("sphere", "cube"), LIGHT),
-    }
-    red = '<default name="red" value="0.2"/>'
-    made = [scene.load(write_scene(tmp_path, red, *some, name=f"{n}.xml")) for n, some in parts.items()]
-    made.append(scene.load(tmp_path / "first.xml", 20, 20))
-    made.append(scene.load(tmp_path / "first.xml", parameters={"red": 0.3}))
-    assert [build(tmp_path, s).cached for s in made] == [False] * len(made)
-    # The same scene by another name and in another folder is the same.
-    (tmp_path / "there").mkdir()
-    assert build(tmp_path, scene.load(write_scene(tmp_path / "there", red, *parts["first"]))).cached
-
-
-@pytest.mark.slow
 def test_a_mesh_is_known_by_its_content(tmp_path):
     def load():
         return scene.load(write_scene(tmp_path, SENSOR, '<shape type="obj"><string name="filename" value='
@@ -143,13 +120,6 @@ def test_a_filter_with_negative_lobes_is_kept_too(tmp_path):
     first = build(tmp_path, lit, 32, 64, spp=4)
     assert first.influence.min() < 0
     assert build(tmp_path, lit, 32, 64, spp=4).cached
-
-
-@pytest.mark.slow
-def test_a_later_version_records_anew(lit, tmp_path, monkeypatch):
-    build(tmp_path, lit)
-    monkeypatch.setattr(light_transport, "_RECORDING", light_transport._RECORDING + 1)
-    assert not build(tmp_path, lit).cached
 
 
 @pytest.mark.slow

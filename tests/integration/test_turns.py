@@ -17,7 +17,7 @@ TORUS = """<sensor type="perspective"><float name="fov" value="35"/>
 <transform name="to_world"><lookat origin="0,2.6,5" target="0,0.3,0" up="0,1,0"/></transform>
 <film type="hdrfilm"><integer name="width" value="32"/><integer name="height" value="32"/></film></sensor>
 <integrator type="path"><integer name="max_depth" value="8"/></integrator>
-<shape type="ply"><string name="filename" value="torus.ply"/>
+<shape type="obj"><string name="filename" value="torus.obj"/>
 <bsdf type="roughdielectric"><float name="alpha" value="0.2"/></bsdf></shape>
 <shape type="rectangle"><transform name="to_world"><scale value="8"/><rotate x="1" angle="-90"/></transform>
 <bsdf type="diffuse"/></shape>
@@ -35,7 +35,7 @@ def cloudy_sky(rng, width=64):
 
 
 def write_torus(path, around=48, across=24, radius=0.4):
-    """Write a torus about the y-axis that stands on y = 0, as PLY."""
+    """Write a torus about the y-axis that stands on y = 0, as OBJ."""
     u = np.repeat(2 * np.pi * np.arange(around) / around, across)
     v = np.tile(2 * np.pi * np.arange(across) / across, around)
     out = 1 + radius * np.cos(v)
@@ -44,24 +44,15 @@ def write_torus(path, around=48, across=24, radius=0.4):
     ahead = np.roll(corner, -1, axis=0)
     aside, across = np.roll(corner, -1, axis=1), np.roll(ahead, -1, axis=1)
     faces = np.stack([corner, aside, across, corner, across, ahead], axis=-1).reshape(-1, 3)
-    header = [
-        "ply",
-        "format ascii 1.0",
-        f"element vertex {len(vertices)}",
-        *(f"property float {axis}" for axis in "xyz"),
-        f"element face {len(faces)}",
-        "property list uchar int vertex_indices",
-        "end_header",
-    ]
-    lines = [" ".join(f"{x:.6f}" for x in vertex) for vertex in vertices]
-    lines += ["3 " + " ".join(map(str, face)) for face in faces]
-    path.write_text("\n".join([*header, *lines]) + "\n")
+    lines = ["v " + " ".join(f"{x:.6f}" for x in vertex) for vertex in vertices]
+    lines += ["f " + " ".join(map(str, face + 1)) for face in faces]
+    path.write_text("\n".join(lines) + "\n")
 
 
 @pytest.mark.parametrize("degrees", [75.0, 250.0])
 def test_a_turn_seen_through_rough_glass_is_found_and_not_spoiled(degrees, rng, tmp_path):
     """The target's noise is larger than what most of its pixels say of the turn."""
-    write_torus(tmp_path / "torus.ply")
+    write_torus(tmp_path / "torus.obj")
     settings = {
         "scene": {"file": str(write_scene(tmp_path, TORUS, name="torus.xml")), "width": 32},
         "target": {"rotate_degrees": degrees, "spp": 64},

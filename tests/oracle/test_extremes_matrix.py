@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from envedit import pipeline
-from envedit.core import latlong, radiance
+from envedit.core import latlong
 from envedit.core.errors import InputError
 from envedit.images import images
 from envedit.representations import LogPixels, Pixels
@@ -67,22 +67,6 @@ def test_the_page_is_current():
 # ---- refusals ----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("value", "says"), [
-    (np.nan, "sky: 2 texels are not finite, the first at row 11, column 3: repair the map"),
-    (-np.inf, "sky: 2 texels are not finite, the first at row 11, column 3: repair the map"),
-    (-1e-30, "sky: 2 texels are negative, the first at row 11, column 3: set them to 0"),
-    (2e30, r"sky: 2 texels are brighter than 1.27e\+30, the first at row 11, column 3: scale the map down"),
-])  # fmt: skip
-def test_what_is_no_radiance_is_refused_by_row_and_column(value, says):
-    m = np.ones((4, 8, 3), np.float32)
-    m[1, 3, 2] = m[2, 0, 0] = value
-    with pytest.raises(InputError, match=f"^{says}$"):
-        radiance.require_radiance(m, "sky", 10, radiance.BRIGHTEST)
-    radiance.require_radiance(np.full((4, 8, 3), 1.2e30, np.float32), "sky", 10, radiance.BRIGHTEST)
-    radiance.require_radiance(np.full((4, 8, 3), 3e38, np.float32), "sky")
-    radiance.require_radiance(-np.zeros((4, 8, 3), np.float32), "sky")
-
-
 def test_rows_of_a_refusal_are_those_of_the_map():
     m = extremes.texel(np.nan)
     with pytest.raises(InputError, match="row 12, column 9"):
@@ -100,20 +84,14 @@ def test_pixels_hold_what_logarithms_cannot():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("value", "error", "says"), [
-    (1e10, None, ""),
-    (1e30, None, ""),
-    (3e38, InputError, "layers: 1 texels are brighter than 1.27e[+]30, the first at row 2, column 5"),
-])  # fmt: skip
-def test_whole_runs_end_finite_or_with_a_reason(value, error, says, tmp_path):
+def test_whole_runs_end_finite_or_with_a_reason(tmp_path):
     m = extremes.sky(8, 16)
-    m[2, 5] = value
-    settings = settings_of(tmp_path, m, target={"rotate_degrees": 90.0}, input={"rows": "all"})
-    if error:
-        with pytest.raises(error, match=says):
-            pipeline.run(settings)
-        return
-    result = pipeline.run(settings)
+    asked = {"target": {"rotate_degrees": 90.0}, "input": {"rows": "all"}}
+    m[2, 5] = 3e38
+    with pytest.raises(InputError, match="layers: 1 texels are brighter than 1.27e[+]30, .* row 2, column 5"):
+        pipeline.run(settings_of(tmp_path, m, **asked))
+    m[2, 5] = 1e30
+    result = pipeline.run(settings_of(tmp_path, m, **asked))
     assert np.isfinite(result.envmap).all() and result.metrics["non_finite_steps"] == 0
 
 

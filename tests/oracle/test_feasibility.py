@@ -195,17 +195,6 @@ def test_white_is_any_value_above(dense, envmap, white):
     assert found.share > 0.9 and (found.picture[2, 3] < 3).all()
 
 
-def test_sentences():
-    blank = np.zeros((1, 1, 3), np.float32)
-    assert "82 %" in feasibility.Reach(0.829, blank, blank, blank).note  # rounded down
-    assert feasibility.Reach(0.5, blank, blank, blank).warning is None
-    warning = feasibility.Reach(0.499, blank, blank, blank, too_dark=0.8).warning
-    assert "49 %" in warning and "brighter without making pixels brighter that are held" in warning
-    dark = feasibility.Reach(0.499, blank, blank, blank, too_dark=0.2, all_painted=True).warning
-    assert "cannot become darker; see" in dark
-    assert "unreachable.png" in warning and "\n" not in warning
-
-
 # ---- the edges ---------------------------------------------------------------------------------------------
 
 

@@ -193,8 +193,8 @@ def test_turn_by_whole_texels_is_a_roll(top, columns, rng):
 def test_core_is_the_plain_one(shape, rng):
     light = patch(rng, 6, 46)
     made = Lights([light], (0, H), W)
-    for _ in range(10):
-        turn, flux, size = random_turn(rng), rng.normal(size=3), rng.uniform(-1, 1)
+    for size in np.linspace(-3, 1, 10):
+        turn, flux = random_turn(rng), rng.normal(size=3)
         expected = plain_core(light, turn, flux, size, shape)
         got = core(made, turn=turn, flux=flux, size=size, shape=shape)
         # What snaps to a texel's centre is at most 2e-4 of a texel off, in rows and in columns.
@@ -236,16 +236,6 @@ def test_flux_is_kept_anywhere_on_the_sphere(top, rng):
         got = core(made, turn=turn)
         assert np.isfinite(got).all() and (got >= 0).all()
         np.testing.assert_allclose(maps.flux(got), expected, rtol=1e-5)
-
-
-@pytest.mark.parametrize("size", [-3.0, -0.7, 0.4, 1.2])
-def test_size_keeps_the_flux(size, rng):
-    light = patch(rng, 10, 10)
-    made, expected = Lights([light], (0, H), W), maps.flux(image_of(light))
-    got = core(made, size=size)
-    np.testing.assert_allclose(maps.flux(got), expected, rtol=1e-5)
-    lit, before = np.count_nonzero(got), np.count_nonzero(image_of(light))
-    assert lit > before if size > 0 else lit <= before
 
 
 def test_rows_that_are_not_wanted_lose_their_flux_and_nothing_else(rng):
@@ -291,10 +281,8 @@ def test_spare_lights_are_lobes_with_the_mean_flux(rng):
                 turn[len(own) + i] = rotation_vector(UP, goal)
                 got = core(made, single(turn), single(flux), single(size), shape=(64, 128))
                 np.testing.assert_allclose(maps.flux(got), np.mean(fluxes, axis=0), rtol=1e-5)
-                d, omega = latlong.directions(64, 128), latlong.lookup_solid_angles(64, 128)[:, None]
-                share = got[..., 0] * omega / (got[..., 0] * omega).sum()
-                near = np.degrees(np.arccos(np.clip(d @ goal, -1, 1))) < 4 * LOBE_DEGREES + 2 * 180 / 64
-                assert share[near].sum() > 0.9
+                near = maps.angle(latlong.directions(64, 128), goal) < 4 * LOBE_DEGREES + 2 * 180 / 64
+                assert (maps.flux(got, near) > 0.9 * maps.flux(got)).all()
 
 
 @pytest.mark.slow
@@ -370,17 +358,6 @@ def test_a_glow_is_no_brighter_wherever_its_light_is(there, strength, rng):
     assert beside[1] == pytest.approx(strength, rel=0.1)
 
 
-def test_twice_a_sun_has_less_than_twice_its_glow(rng):
-    table = np.exp(-np.maximum(GLOW_DEGREES - 2, 0) / 8)[:, None] * np.ones(3) * (GLOW_DEGREES < 40)[:, None]
-    light = patch(rng, 12, 16, glow=table)
-    made = Lights([light], (0, H), W)
-    d = mi.Vector3f(np.ascontiguousarray(light.direction[:, None], np.float32))
-    for factor, strength in ((1e-9, 0), (0.5, 2 / 3), (1, 1), (2, 4 / 3), (1e9, 2)):
-        turn, flux, _ = place(made, flux=np.log(factor))
-        glow = made.glow_of(0, turn, flux, d).numpy() - 1
-        np.testing.assert_allclose(glow, strength, rtol=1e-3, atol=1e-6)
-
-
 def test_spare_lights_have_the_glow_of_the_strongest_light_in_proportion_to_flux(rng):
     table = np.exp(-GLOW_DEGREES / 10)[:, None] * [4.0, 3.0, 2.0] * (GLOW_DEGREES < 60)[:, None]
     own = [patch(rng, 4, 10, peak=100.0, glow=table), patch(rng, 8, 30, peak=3.0, glow=table / 7)]
@@ -396,14 +373,6 @@ def test_spare_lights_have_the_glow_of_the_strongest_light_in_proportion_to_flux
     factor = strength / share
     expected = 1 + 2 * factor / (1 + factor) * share * glow_at(table, cosine)
     np.testing.assert_allclose(got.T, expected, rtol=1e-3)
-
-
-def test_the_glow_before_an_edit_has_no_spare_light_in_it(rng):
-    table = np.exp(-GLOW_DEGREES / 10)[:, None] * np.array([4.0, 3.0, 2.0])
-    light = patch(rng, 4, 10, glow=table)
-    made, d = Lights([light], (0, H), W), unit(rng, 100)
-    got = made.glow_before(mi.Vector3f(d.T.astype(np.float32))).numpy().T
-    np.testing.assert_allclose(got, 1 + glow_at(table, d @ light.direction), rtol=1e-3)
 
 
 # ---- derivatives -----------------------------------------------------------------------------------------
@@ -545,6 +514,8 @@ def test_glow_is_the_product_over_the_lights(rng):
         turns, fluxes, _ = place(made, turn=turn, flux=flux)
         got = made.glow(turns, fluxes, device(d)).numpy().T
         np.testing.assert_allclose(got, plain_glow(own, turn, flux, d), rtol=2e-3)
+    before = made.glow_before(device(d)).numpy().T  # without spare lights
+    np.testing.assert_allclose(before, plain_glow(own, 0 * turn, 0 * flux, d), rtol=2e-3)
     far = plain_glow(own, turn, flux, d) == 1
     assert far.any()
     np.testing.assert_array_equal(got[far], 1)

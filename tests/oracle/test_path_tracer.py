@@ -26,7 +26,6 @@ def sky():
 
 @pytest.fixture(scope="module")
 def weights(matte):
-    """A picture's adjoint with another value in every pixel."""
     return np.random.default_rng(1).random((matte.height, matte.width, 3), dtype=np.float32)
 
 
@@ -45,7 +44,6 @@ def gradients(matte, sky, weights):
 
 @pytest.fixture(scope="module")
 def adjoints(matte, weights):
-    """The same by light transport, one for every seed."""
     y = mi.TensorXf(weights)
     options = {"spp": 64, "max_depth": DEPTH, "memory_gb": 0.5}
     transports = [LightTransport.build(matte, HEIGHT, WIDTH, seed=k, **options) for k in range(STEPS)]
@@ -82,11 +80,6 @@ def test_every_step_has_its_own_samples_and_the_same_ones_again(matte, sky):
         assert (other != first).any(axis=2).mean() > 0.9
     # Not the same samples in another order either: neighbouring steps of neighbouring seeds differ.
     assert (others[0] != others[2]).any(axis=2).mean() > 0.9
-
-
-def test_choices_are_named(matte):
-    text = " ".join(PathTracer(matte, spp="auto", max_depth="auto").choices)
-    assert "samples a pixel" in text and "path depth" in text
 
 
 @pytest.mark.slow

@@ -189,14 +189,6 @@ def test_kept_paths_stay_within_their_memory(air, monkeypatch):
         assert columns.kept_bytes <= int(1.5 * need)
 
 
-def test_paths_of_some_blocks_are_not_kept_for_those_of_all(air, monkeypatch):
-    monkeypatch.setattr(path_vertices, "LANES", 64 * COUNT)
-    columns = columns_of(air)
-    columns.trace(TEXELS, COUNT, SEED, blocks=1)
-    assert not columns._kept
-    assert traced(columns).tobytes() == traced(columns_of(air)).tobytes()
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["in the air", "pair"])
 def test_no_number_of_vertices_needs_its_own_kernels(name, monkeypatch):

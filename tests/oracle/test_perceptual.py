@@ -124,10 +124,6 @@ def test_least_sizes(backbones):
     least = {kind: backbones[kind].least_size() for kind in KINDS}
     assert least == {"vgg": 16, "alex": 31, "squeeze": 17}
     assert backbones["vgg"].least_size("hanning") == 1
-    with pytest.raises(
-        InputError, match="image of 40 rows and 30 columns: too small for AlexNet; it needs 31"
-    ):
-        backbones["alex"].stack(40, 30)
     for kind, n in least.items():
         taps, _ = pulled(backbones[kind], "max", np.ones((n, n, 3)), None)
         assert len(taps[-1]) >= 1 and np.isfinite(taps[-1]).all()
@@ -276,20 +272,18 @@ def test_what_is_not_finite_is_not_hidden(dists, lpips, bad):
 
 
 def test_images_that_do_not_fit_are_refused(dists, lpips):
-    x, y = (single(np.zeros((h, 32, 3))) for h in (32, 33))
-    with pytest.raises(InputError, match="DISTS: image .32, 32, 3. and reference .33, 32, 3. differ"):
-        dists(x, y)
-    with pytest.raises(
-        InputError, match=r"reference: expected an image of shape \(H, W, 3\), got \(4, 4, 1\)"
+    x, y, flat = (single(np.zeros(shape)) for shape in ((32, 32, 3), (33, 32, 3), (4, 4, 1)))
+    leaf, low, grey = single(np.zeros((32, 32, 3))), np.zeros((30, 64, 3)), np.zeros((4, 4))
+    dr.enable_grad(leaf)
+    for measure, images, says in (
+        (dists, (x, y), "DISTS: image .32, 32, 3. and reference .33, 32, 3. differ"),
+        (dists, (x, flat), r"reference: expected an image .* got \(4, 4, 1\)"),
+        (dists, (leaf, leaf), "gradients of the reference"),
+        (lpips["alex"], (np.zeros((4, 4, 3)), grey), r"second image: expected an image .* got \(4, 4\)"),
+        (lpips["alex"], (low, low), "too small for AlexNet; it needs 31 of each"),
     ):
-        dists(x, single(np.zeros((4, 4, 1))))
-    with pytest.raises(InputError, match=r"second image: expected an image .* got \(4, 4\)"):
-        lpips["alex"](np.zeros((4, 4, 3)), np.zeros((4, 4)))
-    with pytest.raises(InputError, match="too small for AlexNet; it needs 31 of each"):
-        lpips["alex"](np.zeros((30, 64, 3)), np.zeros((30, 64, 3)))
-    dr.enable_grad(y)
-    with pytest.raises(InputError, match="gradients of the reference"):
-        dists(y, y)
+        with pytest.raises(InputError, match=says):
+            measure(*images)
 
 
 def test_weights_of_another_network_are_refused(backbones, folder):
@@ -312,9 +306,7 @@ def test_a_backbone_is_loaded_from_either_format(backbones, folder):
     np.savez(folder / "less.npz", **state)
     with pytest.raises(InputError) as info:
         Backbone.load("squeeze", folder / "less.npz")
-    message = str(info.value)
-    assert "no 'features.0.bias' and 1 more of 50 tensors" in message
-    assert "torchvision.models.squeezenet1_1, https://download.pytorch.org/models/squeezenet1_1" in message
+    assert "no 'features.0.bias' and 1 more of 50 tensors" in str(info.value)
     with pytest.raises(InputError, match=r"'features.0.weight' has the shape \(64, 3, 3, 3\), in AlexNet"):
         state |= {f"features.{i}.{what}": 0 for i in (0, 3, 6, 8, 10) for what in ("weight", "bias")}
         np.savez(folder / "mixed.npz", **(state | state_of("squeeze")))

@@ -111,7 +111,6 @@ def connect(shader, key, source, output, kind=Sdf.ValueTypeNames.Float2):
 
 
 def lit_stage(folder):
-    """A stage with a camera and a white dome."""
     stage = new_stage(folder)
     add_camera(stage)
     add_dome(stage)

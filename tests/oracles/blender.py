@@ -43,7 +43,6 @@ def run(script, text=""):
 
 
 def read(path):
-    """Return a picture of Cycles, (h, w, 3)."""
     return np.array(mi.Bitmap(str(path)).convert(mi.Bitmap.PixelFormat.RGB))
 
 

@@ -29,6 +29,16 @@ def stacked(p):
     return np.stack([p[c] for c in "RGB"], -1).astype(np.float32)
 
 
+def floats(path, picture, dtype=np.float32, **more):
+    """Write a picture (H, W, 3) as OpenEXR, past the package: also one that is not finite."""
+    return exr(path, **{c: np.ascontiguousarray(picture[..., i], dtype) for i, c in enumerate("RGB")}, **more)
+
+
+def png(path, values):
+    mi.Bitmap(np.ascontiguousarray(values)).write(str(path))
+    return path
+
+
 def grey(value, height=8, width=16):
     return np.full((height, width, 3), value, np.float32)
 
@@ -49,14 +59,7 @@ def with_chunk(path, kind, data):
     return path
 
 
-def with_segment(path, marker, data):
-    raw = path.read_bytes()
-    path.write_bytes(raw[:2] + bytes([255, marker]) + struct.pack(">H", len(data) + 2) + data + raw[2:])
-    return path
-
-
 def turned(orientation):
-    """Return EXIF data that says so."""
     entry = struct.pack(">HHIHH", 274, 3, 1, orientation, 0)
     return b"MM\0*" + struct.pack(">IH", 8, 1) + entry + bytes(4)
 

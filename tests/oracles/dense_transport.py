@@ -48,7 +48,6 @@ class DenseTransport:
         return mi.TensorXf(dr.ravel(mi.Color3f(*rgb)), (*self.shape, 3))
 
     def linear(self, maps):
-        """Render one map or several."""
         if maps.ndim == 3:
             return self.apply(maps)
         return mi.TensorXf(np.stack([self.apply(mi.TensorXf(one)).numpy() for one in maps.numpy()]))
@@ -68,7 +67,6 @@ class DenseTransport:
         return found.reshape(len(maps), *self.shape, 3).astype(np.float32)
 
     def probe(self, texels):
-        """Return columns, (n, pixels, 3)."""
         return self.weights[:, :, texels].transpose(2, 1, 0)
 
     def overview(self):

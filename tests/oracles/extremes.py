@@ -134,7 +134,6 @@ CELLS = [(name, stage) for name in MAPS for stage in STAGES]
 
 
 def expected(name, stage):
-    """Return the declared outcome of a cell."""
     return EXCEPTIONS.get((name, stage), DONE)
 
 
@@ -148,7 +147,6 @@ def observe(act, *given):
 
 
 def agree(outcome, kind, said):
-    """Assert that a cell ended as it was declared."""
     assert kind == outcome.kind, f"{kind}: {said}"
     if kind == "refused":
         assert type(said) is outcome.error and outcome.words in str(said), f"{type(said).__name__}: {said}"
@@ -174,7 +172,6 @@ def first_line(act):
 
 
 def together(named):
-    """List the names of each value, in the order of their first."""
     found = {}
     for name, value in named.items():
         found.setdefault(value, []).append(name)
@@ -207,7 +204,6 @@ def table(rows, columns, outcome):
 
 
 def document():
-    """Return docs/extremes.md."""
     lines = [
         HEAD,
         "## Maps",

@@ -12,7 +12,7 @@ from envedit.scene import scene
 from envedit.solve import adam_loop
 from envedit.targets import painted_image
 from envedit.transport.light_transport import LightTransport
-from tests.oracles.builders import exr
+from tests.oracles.builders import floats
 from tests.oracles.extremes_stages import (
     FILM,
     Outcome,
@@ -26,7 +26,6 @@ from tests.oracles.extremes_stages import (
     sky,
     ssim_rounding,
     transport,
-    write_plain,
 )
 from tests.oracles.plain import IDENTICAL
 
@@ -37,12 +36,10 @@ STEPS = 10
 
 @functools.cache
 def initial():
-    """Render the sky of the matrix: the picture that is painted on."""
     return transport(16, 32).apply(single(sky())).numpy()
 
 
 def traced():
-    """Trace T of the matrix, without columns."""
     return LightTransport.build(matte(), 16, 32, spp=16, max_depth=3)
 
 
@@ -137,9 +134,8 @@ def _transparent(alpha, light=2.0):
     """Paint light times the rendering, with alpha, in an OpenEXR file."""
 
     def act(folder):
-        paint = (alpha * light * initial()).astype(np.float32)
-        planes = {c: np.ascontiguousarray(paint[..., i]) for i, c in enumerate("RGB")}
-        path = exr(folder / "p.exr", A=np.full(SHAPE, alpha, np.float32), **planes)
+        paint = alpha * light * initial()
+        path = floats(folder / "p.exr", paint, A=np.full(SHAPE, alpha, np.float32))
         found = painted_image.read(path, SHAPE, "gamma", initial())
         np.testing.assert_allclose(found.coverage, alpha, rtol=1e-6)
         mixed = (alpha * light + 1 - alpha) * initial().astype(np.float64)
@@ -168,13 +164,16 @@ def _clipped(share):
 def _not_finite_file(folder):
     picture = initial().copy()
     picture[2, 3, 1] = np.nan
-    painted_image.read(write_plain(folder / "p.exr", picture), SHAPE, "gamma", initial())
+    painted_image.read(floats(folder / "p.exr", picture), SHAPE, "gamma", initial())
 
 
 def done(says):
     return Outcome("done", says)
 
 
+NOT_FINITE = refused(
+    InputError, "target: pixel at row 2, column 3 is not finite: repair it where it comes from"
+)
 TARGETS = {
     "all black": (_even(0.0), done("Followed: light is taken away, the loss falls.")),
     "all white": (_even(1.0), done("Followed: light is added, the loss falls.")),
@@ -187,14 +186,8 @@ TARGETS = {
     ),
     "one pixel of 1e30": (_one(1e30), done("Followed; all other pixels count as not painted.")),
     "one pixel of -5": (_one(-5.0), done("As 0: nothing is darker than black.")),
-    "NaN, given as an array": (
-        _one(np.nan),
-        refused(InputError, "target: pixel at row 2, column 3 is not finite: repair it where it comes from"),
-    ),
-    "+Inf, given as an array": (
-        _one(np.inf),
-        refused(InputError, "target: pixel at row 2, column 3 is not finite: repair it where it comes from"),
-    ),
+    "NaN, given as an array": (_one(np.nan), NOT_FINITE),
+    "+Inf, given as an array": (_one(np.inf), NOT_FINITE),
     "NaN, in a file": (
         _not_finite_file,
         refused(

@@ -92,7 +92,6 @@ def served(name, **more):
 
 
 def until(true, seconds=120):
-    """Wait until something holds."""
     end = time.monotonic() + seconds
     while not true():
         assert time.monotonic() < end, f"not within {seconds} s"
@@ -100,7 +99,6 @@ def until(true, seconds=120):
 
 
 def connected(server, **more):
-    """Open the WebSocket of a served painting."""
     origin = more.pop("origin", server.origins[0])
     from websockets.sync import client
 
@@ -108,7 +106,6 @@ def connected(server, **more):
 
 
 def heard(socket, kind, wanted=lambda message: True):
-    """Return the next message of a kind."""
     while True:
         received = socket.recv(timeout=60)
         if isinstance(received, str):
@@ -128,7 +125,6 @@ def painted(socket, number, document, **more):
 
 
 def asked(address, **more):
-    """Return status and body of an HTTP request."""
     try:
         with urllib.request.urlopen(urllib.request.Request(address, **more), timeout=30) as answer:
             return answer.status, answer.read().decode("utf-8", "replace")

@@ -23,7 +23,6 @@ def double(a):
 
 
 def gradient(loss, x, *args, **kwargs):
-    """Return value and gradient of a loss."""
     x = type(x)(x)
     dr.enable_grad(x)
     value = loss(x, *args, **kwargs)

@@ -65,7 +65,6 @@ def world(folder, rng, **changes):
 
 
 def call(path, *arguments):
-    """Run the command line in this process."""
     return run.main([str(path), *map(str, arguments)])
 
 
@@ -80,7 +79,6 @@ def names(folder):
 
 
 def content(folder):
-    """Return every file of a folder, also of those inside."""
     return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
@@ -123,7 +121,6 @@ def small_world(cache):
 
 
 def pictures(folder):
-    """Return every picture of a folder, as bytes, by name."""
     return {name: data for name, data in content(folder).items() if name.endswith((".exr", ".png"))}
 
 

@@ -91,7 +91,6 @@ def load(name):
 
 
 def sun(row, column):
-    """One texel of 1e5 in a grey sky."""
     image = np.ones((HEIGHT, WIDTH, 3), np.float32)
     image[row, column] = 1e5
     return image

@@ -40,7 +40,6 @@ PRINCIPLED = f"""<bsdf type="twosided"><bsdf type="principled">{IMAGE.format("ba
 
 
 def shaded(bsdf: str, x: float) -> str:
-    """Return a small ball of a material."""
     place = f'<transform name="to_world"><scale value="0.3"/><translate x="{x}"/></transform>'
     return f'<shape type="sphere">{place}{bsdf}</shape>'
 
@@ -72,7 +71,6 @@ LENS = SENSOR.replace('"perspective"', '"thinlens"').replace(
 
 
 def light(scale=None, inside="", name="own.exr") -> str:
-    """Return an environment map as a file has it."""
     given = "" if scale is None else f'<float name="scale" value="{scale}"/>'
     return f'<emitter type="envmap"><string name="filename" value="{name}"/>{given}{inside}</emitter>'
 
@@ -208,7 +206,6 @@ PLUGINS = {
 
 
 def installed() -> set[str]:
-    """Name the plugins of this Mitsuba."""
     return {path.stem for path in (Path(mi.__file__).parent / "plugins").iterdir() if path.suffix != ".py"}
 
 
@@ -250,7 +247,6 @@ def happened(kind: Kind) -> str:
 
 
 def page() -> str:
-    """Return docs/scenes.md."""
     lines = [HEAD, "## Kinds of scenes", "", "| scene | what happens |", "|---|---|"]
     lines += [f"| {kind.name} | {kind.happens.replace('<', '`<').replace('>', '>`')} |" for kind in KINDS]
     lines += ["", "## Plugins", "", "| kind | plugin | what happens |", "|---|---|---|"]

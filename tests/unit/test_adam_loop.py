@@ -16,9 +16,8 @@ from envedit.solve import adam_loop
 from tests.oracles.matrix_renderer import WIDTH, arrays, case, same, sky, without_times
 from tests.oracles.plain import double, gradient, plain_display, single
 
+
 # ---- rows ------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(("first", "rows"), [(0, 3), (2, 3), (3, 3), (5, 1), (0, 6)])
 def test_rows_are_placed_and_all_others_keep_their_bits(first, rows, rng):
     original, crop = sky(rng), sky(rng)[:rows]
@@ -26,8 +25,7 @@ def test_rows_are_placed_and_all_others_keep_their_bits(first, rows, rng):
     expected = original.copy()
     expected[first : first + rows] = crop
     placed = adam_loop.place_rows(mi.TensorXf(original), mi.TensorXf(crop), first)
-    assert placed.shape == original.shape
-    assert placed.numpy().tobytes() == expected.tobytes()
+    assert placed.shape == original.shape and placed.numpy().tobytes() == expected.tobytes()
 
 
 @pytest.mark.parametrize(("first", "rows"), [(0, 3), (2, 3), (0, 6)])
@@ -41,8 +39,6 @@ def test_gradient_reaches_the_placed_rows_only(first, rows, rng):
 
 
 # ---- objective -------------------------------------------------------------------------------------------
-
-
 def test_objective_is_the_weighted_sum_of_its_losses(rng):
     picture, rendering = (rng.random((12, 14, 3)).astype(np.float32) for _ in range(2))
     original, crop = sky(rng)[:3], sky(rng)[:3]
@@ -101,8 +97,6 @@ def test_pixels_without_weight_do_not_count(rng):
 
 
 # ---- the loop --------------------------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["pixels", "log-pixels"])
 def test_edit_finds_the_map_behind_the_picture(kind, rng):
@@ -138,9 +132,8 @@ def test_texels_that_are_not_free_keep_their_bits_and_pull_nothing(rng):
             return objective(rendering, crop, step)
 
     start = params["log_radiance"].numpy()
-    changed, state = adam_loop.optimise(
-        representation, params, Watching(), Listening(), original, 0, arguments[-1], free=free
-    )
+    watched = representation, params, Watching(), Listening(), original, 0, arguments[-1]
+    changed, state = adam_loop.optimise(*watched, free=free)
     for image, crop in zip(seen, crops, strict=True):
         assert image[:3][~free].tobytes() == original[:3][~free].tobytes() == crop[~free].tobytes()
         assert image[3:].tobytes() == original[3:].tobytes()
@@ -181,17 +174,11 @@ def test_no_iterations_leave_the_parameters(rng):
     assert same(arrays(params), arrays(arguments[1])) and state == adam_loop.State()
 
 
-def test_observer_is_told_of_every_row_and_of_the_end(rng):
+def test_observer_is_told_of_every_row_and_may_end_the_run(rng):
     arguments, _ = case(rng, iterations=25)
     seen = []
-    adam_loop.optimise(
-        *arguments, after_step=lambda state, adam: seen.append((state.step, len(state.history)))
-    )
-    assert seen[-1] == (25, 25) and len(seen) >= 3
-    assert all(step == rows for step, rows in seen)
-
-
-def test_what_an_observer_raises_ends_the_run(rng):
+    adam_loop.optimise(*arguments, after_step=lambda s, adam: seen.append((s.step, len(s.history))))
+    assert seen[-1] == (25, 25) and len(seen) >= 3 and all(step == rows for step, rows in seen)
     arguments, _ = case(rng)
 
     def stop(state, adam):
@@ -205,16 +192,12 @@ def test_what_an_observer_raises_ends_the_run(rng):
 
 
 # ---- steps that are not finite ---------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("value", [math.nan, math.inf])
 def test_bad_renderings_are_counted_taken_back_and_halve_the_rate(value, rng):
     """The step that led to a bad rendering is undone, and good steps win the rate back, ten for a halving."""
     arguments, _ = case(rng, iterations=8, lr=0.02, bad={2, 3, 6}, value=value)
     seen = [arrays(arguments[1])]
-    params, state = adam_loop.optimise(
-        *arguments, after_step=lambda _, adam: seen.append(arrays(adam.params))
-    )
+    params, state = adam_loop.optimise(*arguments, after_step=lambda _, a: seen.append(arrays(a.params)))
     assert same(seen[3], seen[1]) and same(seen[4], seen[1]) and same(seen[7], seen[5])
     assert not any(same(seen[i], seen[i + 1]) for i in (0, 1, 2, 4, 5, 6, 7))
     assert (state.bad_steps, state.bad_in_a_row) == (3, 0)
@@ -232,8 +215,6 @@ def test_nineteen_bad_steps_in_a_row_are_survived(rng):
 
 
 # ---- continuing, repeating, cost -------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("cut", [1, 4, 7, 10, 15])
 def test_a_run_that_is_cut_and_continued_gives_the_same_bits(cut, rng):
     """Also where the next step is a bad one, and the step before the cut has to be taken back."""
@@ -257,9 +238,8 @@ def test_a_run_that_is_cut_and_continued_gives_the_same_bits(cut, rng):
     arguments = fresh()
     adam = optimizer.Adam(arguments[1], 123.0, (0.9, arguments[6].beta2))
     adam.load_state_dict(kept["adam"])
-    params, state = adam_loop.optimise(
-        *arguments, adam=adam, state=adam_loop.State(**json.loads(kept["state"]))
-    )
+    state = adam_loop.State(**json.loads(kept["state"]))
+    params, state = adam_loop.optimise(*arguments, adam=adam, state=state)
     assert same(arrays(params), arrays(expected))
     assert json.dumps(without_times(state.history)) == json.dumps(without_times(whole.history))
     assert (state.bad_steps, state.slowdown) == (whole.bad_steps, whole.slowdown)

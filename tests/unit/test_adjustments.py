@@ -97,18 +97,15 @@ def test_what_is_no_light_is_cut_with_a_note(rng):
     assert found.max() <= np.float32(0.52) and "are cut" in notes[-1]
 
 
-def test_a_map_without_lights_is_not_softened():
+def test_lights_are_softened_where_there_are_some(rng):
+    envmap = sunny(rng)
+    found, notes = adjusted(envmap, lights={"soften_degrees": 8.0})
+    np.testing.assert_allclose(flux(found), flux(envmap), rtol=1e-5)
+    assert notes == ["1 light softened by 8 degrees"] and found[12, 3].max() < 0.1 * envmap[12, 3].max()
     envmap = np.full((HEIGHT, WIDTH, 3), 0.5, np.float32)
     found, notes = adjusted(envmap, lights={"soften_degrees": 8.0})
     np.testing.assert_array_equal(found, envmap)
     assert notes == ["no light was found: lights.soften_degrees changes nothing"]
-
-
-def test_lights_are_softened(rng):
-    envmap = sunny(rng)
-    found, notes = adjusted(envmap, lights={"soften_degrees": 8.0})
-    np.testing.assert_allclose(flux(found), flux(envmap), rtol=1e-5)
-    assert notes == ["1 lights softened by 8 degrees"] and found[12, 3].max() < 0.1 * envmap[12, 3].max()
 
 
 @pytest.mark.parametrize("value", [0.0, 1e-30])
@@ -127,16 +124,14 @@ def test_what_cannot_be_is_refused(text):
 @pytest.mark.slow
 def test_a_run_without_a_target(tmp_path, isolated, capsys):
     """The map of the scene at the file's size, a stop brighter; nothing is traced."""
-    users_scenes.write(
-        tmp_path, (users_scenes.PATH, users_scenes.SENSOR, users_scenes.BALL, users_scenes.light(3))
-    )
+    parts = users_scenes.PATH, users_scenes.SENSOR, users_scenes.BALL, users_scenes.light(3)
+    users_scenes.write(tmp_path, parts)
     large = np.random.default_rng(2).random((32, 64, 3)).astype(np.float32)
     images.write_exr(tmp_path / "own.exr", large)
     keys = {"target__kind": "none", "output__exposure": 1.0, "output__spp": 64, "input__width": 16}
-    assert (
-        call(tmp_path / "scene.xml", *changed(**keys, scene__width=16), "--out", str(tmp_path / "out")) == 0
-    )
-    out, found = tmp_path / "out", measured(tmp_path / "out")
+    out = tmp_path / "out"
+    assert call(tmp_path / "scene.xml", *changed(**keys, scene__width=16), "--out", str(out)) == 0
+    found = measured(out)
     np.testing.assert_allclose(pixels(out / "edited_full.exr"), 2 * large, rtol=1e-6)
     ratio = pixels(out / "render_edited.exr").mean() / pixels(out / "render_initial.exr").mean()
     assert ratio == pytest.approx(2, rel=0.02) and found["transport"] is None and found["iterations"] == 0

@@ -16,7 +16,6 @@ KEY = {"scene": "abc", "seed": 3, "grid": [8, 16]}
 
 
 def some(rng, size=3000):
-    """Arrays of every kind that is kept."""
     return {
         "packed": rng.standard_normal((size, 4)).astype(np.float32),
         "start": rng.integers(0, 2**32, 7, dtype=np.uint32),
@@ -32,15 +31,12 @@ def only_file(folder):
     return path
 
 
-def test_the_same_bits_come_back(tmp_path, rng):
+def test_the_same_bits_come_back_of_any_layout(tmp_path, rng):
     cache, arrays = DiskCache(tmp_path / "a" / "b"), some(rng)
     assert cache.load(KEY) is None
     cache.store(KEY, arrays)
     assert same_bits(cache.load(KEY), arrays)
     assert same_bits(DiskCache(tmp_path / "a" / "b").load(dict(reversed(KEY.items()))), arrays)
-
-
-def test_arrays_of_any_layout_are_kept(tmp_path, rng):
     image = rng.random((6, 5, 4))
     DiskCache(tmp_path).store(KEY, {"a": image[::2, :, 1:3].T})
     np.testing.assert_array_equal(DiskCache(tmp_path).load(KEY)["a"], image[::2, :, 1:3].T)
@@ -56,8 +52,6 @@ def test_another_key_finds_nothing_and_a_new_entry_takes_the_place_of_the_old(tm
 
 
 # ---- files that are no good ------------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 def test_no_damage_to_a_single_byte_goes_unseen(tmp_path, rng):
     """Every byte of a small file is changed in turn: nothing, or the same arrays where it was padding."""
@@ -138,8 +132,6 @@ def test_a_full_disk_leaves_what_was_there(tmp_path, rng, monkeypatch):
 
 
 # ---- the bound -------------------------------------------------------------------------------------------
-
-
 def filled(folder, count, used):
     """Store entries of 10 kB and say when each was used last, in seconds; returns cache and paths."""
     cache, paths = DiskCache(folder, most_bytes=35_000), []
@@ -152,25 +144,17 @@ def filled(folder, count, used):
     return cache, paths
 
 
-def test_what_was_not_used_for_longest_makes_room(tmp_path):
+@pytest.mark.parametrize(("looked_at", "size", "kept"), [
+    ((), 2500, [0, 2, 3]), ((1,), 2500, [1, 2, 3]), ((), 10_000, [0, 1, 2]),
+])  # fmt: skip
+def test_what_was_not_used_for_longest_makes_room_for_what_is_no_larger_than_the_bound(
+    looked_at, size, kept, tmp_path
+):
     cache, _ = filled(tmp_path, 3, used=[200, 100, 300])
-    cache.store({"i": 3}, {"a": np.full(2500, 3, np.float32)})
-    kept = [i for i in range(4) if cache.load({"i": i}) is not None]
-    assert kept == [0, 2, 3]
+    assert all(cache.load({"i": i}) is not None for i in looked_at)  # a look is a use
+    cache.store({"i": 3}, {"a": np.full(size, 3, np.float32)})
+    assert [i for i in range(4) if cache.load({"i": i}) is not None] == kept
     assert sum(path.stat().st_size for path in tmp_path.iterdir()) <= 35_000
-
-
-def test_a_look_is_a_use(tmp_path):
-    cache, _ = filled(tmp_path, 3, used=[200, 100, 300])
-    assert cache.load({"i": 1}) is not None
-    cache.store({"i": 3}, {"a": np.full(2500, 3, np.float32)})
-    assert cache.load({"i": 0}) is None and cache.load({"i": 1}) is not None
-
-
-def test_an_entry_above_the_bound_is_not_kept_and_drives_nothing_out(tmp_path):
-    cache, _ = filled(tmp_path, 3, used=[200, 100, 300])
-    cache.store({"i": 3}, {"a": np.zeros(10_000, np.float32)})
-    assert [cache.load({"i": i}) is not None for i in range(4)] == [True, True, True, False]
 
 
 def test_nothing_but_its_own_files_is_deleted(tmp_path):
@@ -204,8 +188,6 @@ def test_what_a_killed_writer_left_is_deleted_but_not_what_is_being_written(tmp_
 
 
 # ---- entries and folders of others -------------------------------------------------------------------------
-
-
 def entry(text, arrays, description=None):
     """An entry with right digests, made without the cache; another description where one is given."""
     head = array_cache._header(text, arrays)

@@ -39,15 +39,10 @@ def test_what_a_glow_has_wrong_is_taken_from_the_elevation(rng):
     assert rough[0] > 0.15 and rough[1] < 0.14
 
 
-def test_a_sky_that_is_the_same_around_the_horizon_stays():
+def test_a_sky_that_is_the_same_around_the_horizon_stays_and_roofs_are_no_sky():
     level = np.exp(D[..., 1:2]) * [0.4, 0.5, 0.7]
     got = changed(level, 1 + 8 * np.exp(-AWAY / 12)[..., None] * np.ones(3))
     np.testing.assert_allclose(got, level, rtol=0.02)
-
-
-def test_roofs_are_no_sky():
-    """Dark houses over half of the horizon do not darken the sky where a sun was."""
-    level = np.exp(D[..., 1:2]) * [0.4, 0.5, 0.7]
     roofs = (D @ [D[SUN][0], 0, D[SUN][2]] < 0)[..., None] & (np.abs(D[..., 1:2]) < np.sin(np.radians(40)))
     houses = np.where(roofs, 0.05, level)
     got = changed(houses, 1 + 8 * np.exp(-AWAY / 12)[..., None] * np.ones(3))

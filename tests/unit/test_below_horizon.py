@@ -79,8 +79,7 @@ def test_a_mirror_follows_a_factor_and_ground_fades(factor):
     np.testing.assert_allclose(found, np.log(factor), rtol=0.12 if factor < 1e-3 else 1e-3)
     kept = Below(low, sky, "keep")
     found = kept.log_factor(tensor(factor * sky)).numpy() / np.log(factor)
-    assert found[0].min() > 0.6 and found[-1].max() < 0.01
-    assert (np.diff(found.mean(axis=(1, 2))) < 0).all()
+    assert found[0].min() > 0.6 and found[-1].max() < 0.01 and (np.diff(found.mean(axis=(1, 2))) < 0).all()
 
 
 def test_ground_follows_the_glow_above_it_as_far_as_it_continues_the_sky():
@@ -91,8 +90,7 @@ def test_ground_follows_the_glow_above_it_as_far_as_it_continues_the_sky():
     for share in (0.0, 0.1, 0.2, 1.0):
         below = Below(0.2 * low**share, sky, "keep")
         factors[share] = below.log_factor(tensor(sunless)).numpy()
-    assert not factors[0.0].any()
-    assert factors[1.0].min() < -0.3
+    assert not factors[0.0].any() and factors[1.0].min() < -0.3
     np.testing.assert_allclose(factors[0.1], 0.5 * factors[0.2], rtol=0.02, atol=1e-3)
     assert factors[0.2].min() < 0.3 * factors[1.0].min()
     opposite = Below(0.2 / low, sky, "keep")
@@ -164,8 +162,6 @@ def test_a_channel_that_is_black_in_the_sky_does_not_burst_below_it(kind, channe
 
 
 # ---- in layers ---------------------------------------------------------------------------------------------
-
-
 def moved(sun=(24, 20)):
     image = mirror((64, 128), sun)
     made = Layers.of(image, horizon="mirror")
@@ -198,12 +194,14 @@ def test_gradient_of_a_whole_map_is_that_of_finite_differences(rng):
     _, made, params, _ = moved()
     weight = rng.normal(size=(64, 128, 3))
     grid = rng.normal(0, 0.3, params["gain.0"].shape)
-    _, found = gradient(
-        lambda x: dr.sum((made.decode(params | {"gain.0": x}) * tensor(weight)).array), tensor(grid)
-    )
+
+    def decoded(x):
+        return made.decode(params | {"gain.0": x})
 
     def total(values):
-        return (np.float64(made.decode(params | {"gain.0": tensor(values)}).numpy()) * weight).sum()
+        return (np.float64(decoded(tensor(values)).numpy()) * weight).sum()
+
+    _, found = gradient(lambda x: dr.sum((decoded(x) * tensor(weight)).array), tensor(grid))
 
     for _ in range(3):
         way = rng.normal(size=grid.shape)

@@ -77,10 +77,3 @@ def test_the_ends_are_the_maps_bit_for_bit_and_sizes_are_those_of_the_first(rng,
         out = str(tmp_path / f"c{amount}.exr")
         assert run(tmp_path, capsys, "--amount", amount, "--out", out)[0] == 0
         assert images.read(out)[0].shape == (8, 16, 3)
-
-
-def test_an_input_is_never_the_result(rng, tmp_path, capsys):
-    for name in "ab":
-        images.write_exr(tmp_path / f"{name}.exr", np.ones((6, 12, 3), np.float32))
-    code, said = run(tmp_path, capsys, "--amount", "0.5", "--out", str(tmp_path / "b.exr"), "--overwrite")
-    assert code == 2 and "is read by this command" in said["error"] and not said["ok"]

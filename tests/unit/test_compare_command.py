@@ -44,8 +44,7 @@ def test_a_map_and_itself(rng, said, tmp_path):
 def test_a_stop_brighter_and_turned(rng, said):
     envmap = sunny(rng)
     found = said(envmap, 2 * latlong.rotate(envmap, 90))
-    assert not found["identical"]
-    assert found["irradiance"]["+y"]["stops"] == pytest.approx(1, abs=1e-3)
+    assert not found["identical"] and found["irradiance"]["+y"]["stops"] == pytest.approx(1, abs=1e-3)
     (light,) = found["lights"]["after"]
     elevation = np.radians(light["elevation"])
     arc = 2 * np.arcsin(np.cos(elevation) * np.sin(np.pi / 4))

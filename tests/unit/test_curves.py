@@ -21,7 +21,7 @@ def points_of(svg, name):
     return [(p[0], float(p[1:]), float(y)) for p, y in zip(pen[::2], pen[1::2], strict=True)]
 
 
-def test_curve_is_straight_for_a_geometric_series():
+def test_curve_is_straight_for_a_geometric_series_and_interrupted_where_there_is_no_value():
     rows = [{"iteration": 10 * i, "loss": 0.5**i, "ssim": 0.25 * 0.5**i, "lr": 1e-4} for i in range(9)]
     points = points_of(curves.curves_svg(rows), "loss")
     steps = np.diff([(x, y) for _, x, y in points], axis=0)
@@ -30,9 +30,6 @@ def test_curve_is_straight_for_a_geometric_series():
     lower = points_of(curves.curves_svg(rows), "ssim")
     assert lower[0][2] == pytest.approx(points[2][2], abs=0.11), "0.25 stands where 0.5^2 does"
     assert "lr" not in curves.curves_svg(rows)
-
-
-def test_curve_is_interrupted_where_there_is_no_value():
     values = [1.0, 0.5, np.nan, 0.25, None, 0.0, -1.0, 0.2, np.inf, "text", 0.1]
     svg = curves.curves_svg([{"iteration": i, "loss": v} for i, v in enumerate(values)])
     assert [move for move, _, _ in points_of(svg, "loss")] == ["M", "L", "M", "M", "M"]
@@ -62,15 +59,12 @@ def test_any_history_makes_a_well_formed_drawing(rows):
         assert not re.search(r"\d?(nan|inf)\b", drawn)
 
 
-@pytest.mark.parametrize(
-    "values, labels",
-    [
-        ([1.0, 0.1, 0.002], ["0.002", "0.01", "0.1", "1"]),
-        ([0.41, 0.39], ["0.39", "0.41"]),
-        ([3e-5], ["3e-05"]),
-        ([1e300, 1e-300], ["1e+288", *(f"1e+{d}" for d in range(289, 301))]),
-    ],
-)
+@pytest.mark.parametrize("values, labels", [
+    ([1.0, 0.1, 0.002], ["0.002", "0.01", "0.1", "1"]),
+    ([0.41, 0.39], ["0.39", "0.41"]),
+    ([3e-5], ["3e-05"]),
+    ([1e300, 1e-300], ["1e+288", *(f"1e+{d}" for d in range(289, 301))]),
+])  # fmt: skip
 def test_axis_has_its_ends_and_the_powers_of_ten_between(values, labels):
     svg = curves.curves_svg([{"iteration": i, "loss": value} for i, value in enumerate(values)])
     texts = [e for e in ElementTree.fromstring(svg) if e.get("text-anchor") == "end"]
@@ -81,9 +75,6 @@ def test_axis_has_its_ends_and_the_powers_of_ten_between(values, labels):
 
 
 def test_losses_in_units_of_a_changing_noise_are_not_drawn():
-    rows = [
-        {"iteration": i, "loss": 9 + i, "data": 8 + i, "sigma": 1 / (1 + i), "residual": 0.1 / (1 + i)}
-        for i in range(3)
-    ]
-    svg = curves.curves_svg(rows)
+    rows = [{"iteration": i, "loss": 9 + i, "data": 8 + i, "sigma": 1 / (1 + i)} for i in range(3)]
+    svg = curves.curves_svg([row | {"residual": 0.1 * row["sigma"]} for row in rows])
     assert "residual 0.0333" in svg and "loss 1" not in svg and "data" not in svg

@@ -49,14 +49,12 @@ def encoded(working, rows=ROWS, free=None, aureoles=True):
 
 
 def sent(made, params, v, light=0):
-    """Move a light to a direction."""
     params = {k: v.copy() for k, v in params.items()}
     params["turn"][light] = rotation_vector(made.lights.centres[light], v) / layers.SCALES["turn"]
     return params
 
 
 def carried(made, params, working, source, rows=ROWS, free=None):
-    """Return the edit at both resolutions."""
     params = {k: mi.TensorXf(v) for k, v in params.items()}
     edited = working.copy()
     edited[rows[0] : rows[0] + rows[1]] = made.decode(params).numpy()
@@ -85,8 +83,6 @@ def sunny():
 
 
 # ---- layers: what stays ------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("band", [1 << 21, 700, 5120])
 def test_no_edit_is_the_source_bit_for_bit(sunny, band, monkeypatch):
     monkeypatch.setattr(texel_maps, "BAND_TEXELS", band)
@@ -150,8 +146,6 @@ def test_texels_far_from_a_moved_light_without_glow_keep_their_bits():
 
 
 # ---- layers: what changes ----------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("value", [-1.0, 0.7])
 def test_an_even_gain_is_the_formula(value):
     source = sky(128, 256, sun=None)
@@ -312,8 +306,6 @@ def test_what_is_not_finite_is_refused(sunny):
 
 
 # ---- other representations ---------------------------------------------------------------------------------
-
-
 def ratio(working, edited, source, rows=ROWS, free=None):
     result = full_resolution.carry(Pixels(), {}, working, edited, source, Rows(*rows, len(working)), free)
     assert result.dtype == np.float32 and np.isfinite(result).all() and (result >= 0).all()
@@ -321,7 +313,6 @@ def ratio(working, edited, source, rows=ROWS, free=None):
 
 
 def around(m):
-    """Most of a texel and its neighbours."""
     padded = np.pad(np.pad(m, ((1, 1), (0, 0), (0, 0)), mode="edge"), ((0, 0), (1, 1), (0, 0)), mode="wrap")
     shifts = [(r, c) for r in (0, 1, 2) for c in (0, 1, 2)]
     return np.max([padded[r : r + m.shape[0], c : c + m.shape[1]] for r, c in shifts], axis=0)
@@ -415,8 +406,7 @@ def test_a_sun_that_is_gone_leaves_no_ghost():
     working = small(source)
     edited = sun_turned(working)
     result, old = ratio(working, edited, source), near((512, 1024), toward(25, 200), 6)
-    assert result[old].max() < 4 * np.median(result[old])
-    assert source[old].max() > 1e4 * np.median(source[old])
+    assert result[old].max() < 4 * np.median(result[old]) and source[old].max() > 1e4 * np.median(source[old])
 
 
 @pytest.mark.parametrize("shape", [(64, 128), (48, 96)])
@@ -430,8 +420,6 @@ def test_a_source_that_is_not_larger_takes_the_edited_map(shape, rng):
 
 
 # ---- rows below the horizon that follow --------------------------------------------------------------------
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("finer", [2, 4])
 @pytest.mark.parametrize("kind", ["mirror", "keep"])

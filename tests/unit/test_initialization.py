@@ -51,15 +51,12 @@ def test_weights_have_a_mean_of_one_and_are_told(rng):
     assert weight[11, 21] == 0 and "% of the pixels are dominated by Monte Carlo noise" in said
 
 
-def test_a_mask_counts_too(rng):
+def test_a_mask_counts_too_and_is_kept_around_nothing_but_noise(rng):
     recordings, base = seen(rng)
     mask = np.ones((24, 32, 1), np.float32)
     mask[:, :8] = 0
     weight = initialization.trusted(MAP, recordings, target(base, mask))[0].weight
     assert not weight[:, :8].any() and weight[0, 31] > 1
-
-
-def test_a_mask_around_nothing_but_noise_is_kept_as_it_is(rng):
     recordings, base = seen(rng)
     mask = np.zeros((24, 32, 1), np.float32)
     mask[10:13, 20:23] = 1
@@ -67,15 +64,10 @@ def test_a_mask_around_nothing_but_noise_is_kept_as_it_is(rng):
     assert initialization.trusted(MAP, recordings, asked) == (asked, [])
 
 
-@pytest.mark.parametrize(
-    "cycles, coverage, spp, wanted",
-    [
-        ("auto", None, 256, (256, 32)),
-        ("auto", None, 16, (16, 16)),
-        (12, None, 256, (256, None)),
-        ("auto", MAP, 256, (256, None)),
-    ],
-)
+@pytest.mark.parametrize("cycles, coverage, spp, wanted", [
+    ("auto", None, 256, (256, 32)), ("auto", None, 16, (16, 16)), (12, None, 256, (256, None)),
+    ("auto", MAP, 256, (256, None)),
+])  # fmt: skip
 def test_a_second_recording_is_made_where_detail_is_asked_about(cycles, coverage, spp, wanted, monkeypatch):
     asked = tracing(monkeypatch, [])
     found = recorded({"representation": {"cycles": cycles}}, Traced(spp), coverage)
@@ -85,18 +77,15 @@ def test_a_second_recording_is_made_where_detail_is_asked_about(cycles, coverage
     assert bool(found.notes) == (second is not None)
 
 
-@pytest.mark.parametrize(
-    "octaves, renderer, spp, size, wanted",
-    [
-        (["one"], {}, 64, 256, 256),  # 0.8 of the 2 GB
-        (["one"], {"memory_gb": "auto"}, 64, 256, 256),
-        (["one"], {"memory_gb": 1.0}, 64, 256, 128),
-        (["one"], {}, 16, 1024, None),  # more do not fit
-        (["one"], {}, 256, 128, None),
-        (["one"], {"spp": 64}, 64, 256, None),  # what was asked for is taken
-        ([], {}, 64, 256, None),
-    ],
-)
+@pytest.mark.parametrize("octaves, renderer, spp, size, wanted", [
+    (["one"], {}, 64, 256, 256),  # 0.8 of the 2 GB
+    (["one"], {"memory_gb": "auto"}, 64, 256, 256),
+    (["one"], {"memory_gb": 1.0}, 64, 256, 128),
+    (["one"], {}, 16, 1024, None),  # more do not fit
+    (["one"], {}, 256, 128, None),
+    (["one"], {"spp": 64}, 64, 256, None),  # what was asked for is taken
+    ([], {}, 64, 256, None),
+])  # fmt: skip
 def test_where_detail_is_told_a_large_picture_gets_more_samples(
     octaves, renderer, spp, size, wanted, monkeypatch
 ):
@@ -112,13 +101,9 @@ def test_where_detail_is_told_a_large_picture_gets_more_samples(
     assert str(wanted) in found.notes[-1] and str(spp) in found.notes[-1]
 
 
-def test_no_detail_is_looked_for_that_a_small_map_cannot_hold(monkeypatch):
+def test_small_maps_and_path_tracers_keep_their_recording(monkeypatch):
     asked = tracing(monkeypatch, ["one"])
     assert recorded({}, first := Traced(256), width=46) == initialization.Recordings(first) and not asked
-
-
-def test_a_path_tracer_s_recording_stays_as_it_is(monkeypatch):
-    asked = tracing(monkeypatch, ["one"])
     found = recorded({"renderer": {"kind": "path", "spp": 16}}, None, size=256)
     assert [spp for _, spp in asked] == ["auto", 32] and found.transport.spp == 64
 

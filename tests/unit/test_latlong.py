@@ -11,7 +11,6 @@ from tests.oracles.plain import lookup
 
 
 def mitsuba_eval(image, d):
-    """Radiance of Mitsuba's envmap built from a bitmap, at directions (N, 3)."""
     scene = mi.load_dict({"type": "scene", "e": {"type": "envmap", "bitmap": mi.Bitmap(image)}})
     si = dr.zeros(mi.SurfaceInteraction3f)
     si.wi = -mi.Vector3f(*np.asarray(d, np.float32).T)
@@ -77,6 +76,8 @@ def test_solid_angles_count_nearest_directions(rng):
     expected = latlong.solid_angles(6, 12) * 12 / (4 * np.pi)
     z = (share - expected) / np.sqrt(expected * (1 - expected) / len(d))
     assert np.abs(z).max() < 4.0  # six rows, p = 4e-4 in all
+    np.testing.assert_array_equal(latlong.row_edges(1), [0, 1])
+    np.testing.assert_allclose(latlong.row_edges(3), [0, 0.25, 0.75, 1])
 
 
 @pytest.mark.slow
@@ -88,11 +89,6 @@ def test_lookup_solid_angles_integrate_the_interpolation():
     rows = np.eye(5)[:, None, :] * np.ones((5, 10, 1))  # channel r lights row r
     integral = (lookup(rows, d) * weight).sum((0, 1)) / 10
     np.testing.assert_allclose(integral, latlong.lookup_solid_angles(5, 10), rtol=1e-5)
-
-
-def test_row_edges():
-    np.testing.assert_array_equal(latlong.row_edges(1), [0, 1])
-    np.testing.assert_allclose(latlong.row_edges(3), [0, 0.25, 0.75, 1])
 
 
 @pytest.mark.parametrize("size", [(16, 32), (10, 20), (7, 31), (1, 1), (24, 50), (31, 5), (2, 64)])
@@ -124,8 +120,7 @@ def test_a_dim_texel_survives_beside_a_bright_one():
     image = np.full((64, 128, 3), 1e-30, np.float32)
     image[20, 20] = 65504
     small = latlong.resize(image, 16, 32)
-    assert small[0, 0, 0] == pytest.approx(1e-30, rel=1e-6)
-    assert (small > 0).all()
+    assert small[0, 0, 0] == pytest.approx(1e-30, rel=1e-6) and (small > 0).all()
 
 
 def test_growing_samples_the_interpolated_map(rng):
@@ -139,6 +134,7 @@ def test_growing_samples_the_interpolated_map(rng):
         lit[row, 255] = 1
         flux = latlong.resize(lit, 256, 512).sum((1, 2)) @ latlong.lookup_solid_angles(256, 512)
         assert flux == pytest.approx(latlong.lookup_solid_angles(128, 256)[row], rel=tolerance)
+    assert np.array_equal(latlong.resize(np.full((1, 4, 3), 2.0), 5, 4), np.full((5, 4, 3), 2.0))
 
 
 def test_rotate(rng):
@@ -176,7 +172,3 @@ def test_refusals():
         latlong.from_envmap_data(np.zeros((4, 3, 3)))
     with pytest.raises(ConfigError, match="got 0 x 4 texels"):
         latlong.resize(np.zeros((4, 8, 3)), 4, 0)
-
-
-def test_a_single_row_grows():
-    assert np.array_equal(latlong.resize(np.full((1, 4, 3), 2.0), 5, 4), np.full((5, 4, 3), 2.0))

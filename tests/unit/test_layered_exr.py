@@ -20,7 +20,7 @@ def parts(rng):
     return {"initial": initial, "edited": edited, "difference": edited - initial, "influence": influence}
 
 
-def test_layers_come_back_by_name(tmp_path, parts):
+def test_layers_come_back_by_name_and_other_programs_see_the_edited_map(tmp_path, parts):
     path = tmp_path / "layers.exr"
     layered_exr.write(path, parts)
     file = OpenEXR.File(str(path), separate_channels=True)
@@ -38,11 +38,6 @@ def test_layers_come_back_by_name(tmp_path, parts):
     assert header["compression"] == OpenEXR.ZIP_COMPRESSION
     assert header["envmap"] == OpenEXR.ENVMAP_LATLONG and "chromaticities" in header
     assert [p.name for p in tmp_path.iterdir()] == ["layers.exr"]
-
-
-def test_other_programs_see_the_edited_map(tmp_path, parts):
-    path = tmp_path / "layers.exr"
-    layered_exr.write(path, parts)
     np.testing.assert_array_equal(images.read(path)[0], parts["edited"])
     split = dict(mi.Bitmap(str(path)).split())
     assert set(split) == {"<root>", "initial", "difference", "influence"}

@@ -5,15 +5,8 @@ import numpy as np
 import pytest
 
 from envedit.losses import display_curve
-from envedit.solve.likelihood import (
-    INDEPENDENT,
-    PAINT_NOISE,
-    STATEMENTS,
-    VISIBLE,
-    Likelihood,
-    of_mean,
-    on_average_one,
-)
+from envedit.solve import likelihood
+from envedit.solve.likelihood import INDEPENDENT, PAINT_NOISE, STATEMENTS, VISIBLE, Likelihood
 from envedit.targets.pixel_weights import pixel_weight
 
 FILM = (20, 24)
@@ -34,7 +27,6 @@ def pictures(coverage, before=0.2, after=0.5):
 
 
 def formula(one, residual, sigma):
-    """The formula of the module, pixel by pixel."""
     area, total = one.weight.size / one.independent, 0.0
     for w, r in zip(one.weight.ravel(), residual.reshape(-1, 3), strict=True):
         size = np.sqrt((r**2).mean())
@@ -50,7 +42,7 @@ def formula(one, residual, sigma):
 @pytest.mark.parametrize("sigma", [0.02, 0.2])
 @pytest.mark.parametrize(("painted", "mean"), [(False, 0.01), (True, 0.01), (True, 0.1)])
 def test_misfit_is_that_of_the_formula(sigma, painted, mean, rng):
-    one = of_stroke()[0] if painted else Likelihood(on_average_one(rng.random((*FILM, 1)), FILM))
+    one = of_stroke()[0] if painted else Likelihood(likelihood.on_average_one(rng.random((*FILM, 1)), FILM))
     residual = rng.normal(mean, 0.1, (*FILM, 3))
     assert one.misfit(residual, sigma) == pytest.approx(formula(one, residual, sigma), rel=1e-5)
     assert one.misfit(0 * residual, sigma) == 0
@@ -60,7 +52,7 @@ def test_misfit_is_that_of_the_formula(sigma, painted, mean, rng):
 @pytest.mark.parametrize("painted", [False, True])
 def test_weights_are_those_of_the_first_parts_gradient(painted, rng):
     """By finite differences; of a residual whose mean of the rest is 0, so that the last part has none."""
-    one = of_stroke()[0] if painted else Likelihood(on_average_one(None, FILM))
+    one = of_stroke()[0] if painted else Likelihood(likelihood.on_average_one(None, FILM))
     residual, sigma, h = rng.normal(0, 0.1, (*FILM, 3)), 0.1, 1e-5
     residual -= one.mean(residual) * (one.rest > 0) / max(one.share.sum(), 1e-30) if painted else 0
     gradient = 2 * one.weights(residual, sigma) * residual
@@ -79,7 +71,7 @@ def test_the_mean_is_scaled_to_have_the_gradient_of_its_loss(change):
     share, mean = one.linear_mean(residual)
     for c in range(3):
         ends = [residual + sign * h * (np.arange(3) == c) * (1 - coverage) for sign in (1, -1)]
-        slope = np.subtract(*(of_mean(one.mean(end)) for end in ends)) / (2 * h)
+        slope = np.subtract(*(likelihood.of_mean(one.mean(end)) for end in ends)) / (2 * h)
         assert 2 * (share * (1 - coverage)).sum() * mean[c] == pytest.approx(slope, rel=1e-4, abs=1e-6)
 
 
@@ -130,7 +122,7 @@ def test_white_is_what_most_of_the_picture_was_below_and_at_least_one(before, wh
 
 @pytest.mark.parametrize("film", [(6, 8), FILM, (64, 64)])
 def test_noise_with_hubers_loss_makes_the_misfit_that_of_independent_values(film, rng):
-    one = Likelihood(on_average_one(None, film))
+    one = Likelihood(likelihood.on_average_one(None, film))
     residual = rng.normal(0, 0.03, (*film, 3)) * np.where(rng.random((*film, 1)) < 0.1, 20, 1)
     found = one.noise(residual, 1e-4)
     assert one.misfit(residual, found) == pytest.approx(3 * INDEPENDENT, rel=1e-6)
@@ -146,11 +138,10 @@ def test_all_paint_is_a_few_statements_whatever_its_size(rows):
     painted = 1 / 1.3 if rows < 20 else 1
     assert one.independent == pytest.approx(STATEMENTS / painted, rel=1e-5)
     assert (one.rest is None) == (rows == 20)
-    assert on_average_one(one.weight, (20, 240)).mean() == pytest.approx(1, rel=1e-5)
+    assert likelihood.on_average_one(one.weight, (20, 240)).mean() == pytest.approx(1, rel=1e-5)
     pattern = 0.1 * (1 - coverage) * (-1.0) ** np.arange(240)[:, None]
-    assert one.misfit(np.broadcast_to(pattern, residual.shape), 0.1) == pytest.approx(
-        0.3 * 3 * STATEMENTS * (rows < 20), rel=1e-5
-    )
+    found = one.misfit(np.broadcast_to(pattern, residual.shape), 0.1)
+    assert found == pytest.approx(0.3 * 3 * STATEMENTS * (rows < 20), rel=1e-5)
 
 
 def test_the_mean_of_the_rest_is_known_to_a_visible_change():
@@ -173,9 +164,8 @@ def test_pixels_that_do_not_count_are_not_of_the_rest(rng):
     residual = rng.normal(0, 0.1, (*FILM, 3))
     inside = np.where(out[..., None], 0, residual)
     assert one.misfit(residual, 0.1) == pytest.approx(one.misfit(inside, 0.1), rel=1e-9)
-    assert one.mean(residual) == pytest.approx(
-        np.sqrt(0.5) * residual[5:10].mean(axis=(0, 1)) / VISIBLE, rel=1e-4
-    )
+    mean = residual[5:10].mean(axis=(0, 1))
+    assert one.mean(residual) == pytest.approx(np.sqrt(0.5) * mean / VISIBLE, rel=1e-4)
     # Where the rest has no weight its mean is not held either.
     without = Likelihood.of_paint(pixel_weight(coverage, out, 1.0, 0.0), coverage, *pictures(coverage))
     assert not without.mean(residual).any()

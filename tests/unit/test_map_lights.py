@@ -27,11 +27,8 @@ def sunny(rng, peak=5000.0):
 def written(envmap, tmp_path, name="sky.exr", **how):
     (images.write_hdr if name.endswith("hdr") else images.write_exr)(tmp_path / name, envmap, **how)
     assert lights.main([str(tmp_path / name), "--out", str(tmp_path / "out"), "--json"]) == 0
-    parts = [
-        images.load_envmap(tmp_path / "out" / f"{name}.exr", convert=False) for name in ("sky", "lights")
-    ]
-    (sky, info), (alone, _) = parts
-    return sky, alone, info
+    sky, info = images.load_envmap(tmp_path / "out" / "sky.exr", convert=False)
+    return sky, images.load_envmap(tmp_path / "out" / "lights.exr", convert=False)[0], info
 
 
 @pytest.mark.parametrize(
@@ -40,8 +37,7 @@ def written(envmap, tmp_path, name="sky.exr", **how):
 def test_sky_and_lights_sum_to_the_map_bit_for_bit(how, rng, tmp_path, capsys):
     sky, alone, info = written(sunny(rng), tmp_path, **how)
     stored, _ = images.load_envmap(tmp_path / how.get("name", "sky.exr"), convert=False)
-    assert alone[AT].min() > 100 and sky[AT].max() < 2
-    assert np.array_equal(sky + alone, stored)
+    assert alone[AT].min() > 100 and sky[AT].max() < 2 and np.array_equal(sky + alone, stored)
     assert (info["chromaticities"] is None) == ("chromaticities" not in how)
 
 
@@ -84,18 +80,10 @@ def test_irradiance_of_an_even_sky_is_pi():
     np.testing.assert_allclose(map_lights.irradiance(even, normals), 2 * math.pi, rtol=1e-3)
 
 
-def test_a_black_map_has_no_lights(tmp_path, capsys):
+def test_a_black_map_has_no_lights_and_bad_input_is_one_line(tmp_path, capsys):
     sky, alone, _ = written(np.zeros((6, 12, 3), np.float32), tmp_path)
     assert not sky.any() and not alone.any()
     assert json.loads(capsys.readouterr().out)["lights"] == []
-
-
-def test_bad_input_is_one_line(tmp_path, capsys):
     assert lights.main([str(tmp_path / "none.exr"), "--json"]) == 3
     out, err = capsys.readouterr()
     assert "no such file" in json.loads(out)["error"] and len(err.splitlines()) == 1
-    bad = np.full((6, 12, 3), np.nan, np.float32)
-    bad[0, 0] = 1
-    bad.tofile(tmp_path / "x.raw")
-    assert lights.main([str(tmp_path / "x.raw")]) == 3
-    assert "not an image" in capsys.readouterr().err

@@ -55,10 +55,8 @@ def test_a_gradient_over_the_whole_sky_is_less_than_patches_of_the_same_size():
     east, d = DIRECTIONS[..., 0], DIRECTIONS.reshape(-1, 3)
     patchy = np.cos(np.radians(360 / 40) * np.degrees(np.arctan2(d[:, 0], -d[:, 2]))).reshape(GRID)
     sizes = [np.sqrt((OMEGA * f[:HALF] ** 2).sum() / OMEGA.sum()) for f in (east, patchy)]
-    found = [
-        naturalness.patches(grey(-0.3 * f / size), grey(np.zeros(GRID)))
-        for f, size in zip((east, patchy), sizes, strict=True)
-    ]
+    changes = [-0.3 * f / size for f, size in zip((east, patchy), sizes, strict=True)]
+    found = [naturalness.patches(grey(change), grey(np.zeros(GRID))) for change in changes]
     assert found[0] < 0.75 * found[1]
 
 

@@ -35,7 +35,6 @@ def points(rng, count):
 
 
 def gradient(network, params, x, seed_grad):
-    """Gradient of sum(seed_grad * y) through the AD graph."""
     leaves = {name: mi.TensorXf(value) for name, value in params.items()}
     dr.enable_grad(leaves)
     dr.backward(dr.sum((network(leaves, x, OMEGA) * seed_grad).array))
@@ -43,7 +42,6 @@ def gradient(network, params, x, seed_grad):
 
 
 def ours(params, x, seed_grad):
-    """The same gradient by the hand-written pass."""
     return gradient(siren.evaluate, params, x, seed_grad)
 
 
@@ -55,9 +53,6 @@ def differ(a, b, tolerance=1e-4):
     assert list(a) == list(b) and all(a[name].shape == b[name].shape for name in a)
     assert all(np.linalg.norm(b[name]) > 0 for name in b)
     return [name for name in b if not np.linalg.norm(a[name] - b[name]) < tolerance * np.linalg.norm(b[name])]
-
-
-# ---- forward ---------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("hidden", "depth"), [(1, 0), (7, 0), (33, 2), (16, 6)])
@@ -80,9 +75,6 @@ def test_extreme_outputs_saturate_without_overflow():
     np.testing.assert_array_equal(y.numpy(), np.repeat([[0.0, 0.5, 1.0]], 8, axis=0))
     grads = siren.backward(params, tape, own(np.ones((8, 3))))
     assert all(np.isfinite(g.numpy()).all() for g in grads.values())
-
-
-# ---- gradient --------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("depth", range(8))
@@ -141,9 +133,6 @@ def test_gradient_flows_on_in_a_larger_graph(rng):
     got = np.sum(np.array(dr.grad(leaves["1.bias"]), np.float64) * np.array(params["1.bias"])) / 2
     assert got != 0
     np.testing.assert_allclose(dr.grad(gain)[0], got, rtol=1e-4)
-
-
-# ---- initial weights, coordinates ------------------------------------------------------------------------
 
 
 def test_initial_weights_are_uniform_within_the_published_bounds():

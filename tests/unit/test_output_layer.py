@@ -25,7 +25,6 @@ def weights(light, share):
 
 
 def error(params, x, wanted, light, share):
-    """Weighted squared error by the network in float64."""
     y = numpy_forward(arrays(params), x.numpy(), OMEGA)
     return np.sum(weights(light, share) * (y - wanted) ** 2)
 
@@ -58,9 +57,6 @@ def again(params, times, x, wanted, light, share):
     for _ in range(times):
         params = output_layer.last_layer(params, x, OMEGA, wanted, light, share)
     return params
-
-
-# ---- what is solved --------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("share", [0.0, 1.0, 30.0])
@@ -102,9 +98,6 @@ def test_a_last_layer_that_explains_everything_is_found(rng):
         np.testing.assert_allclose(solved[name].numpy(), truth[name].numpy(), atol=1e-4)
 
 
-# ---- what is left alone ----------------------------------------------------------------------------------
-
-
 def test_all_but_the_last_layer_stays_and_the_order_of_the_parameters(rng):
     params, x, wanted, light = problem(rng)
     for order in (list(params), sorted(params, reverse=True)):
@@ -120,9 +113,8 @@ def test_all_but_the_last_layer_stays_and_the_order_of_the_parameters(rng):
 
 
 def unchanged(params, solved):
-    return list(params) == list(solved) and all(
-        params[name].numpy().tobytes() == solved[name].numpy().tobytes() for name in params
-    )
+    before, after = ({name: value.numpy().tobytes() for name, value in p.items()} for p in (params, solved))
+    return list(before.items()) == list(after.items())
 
 
 def test_steps_that_lead_too_far_are_not_taken():
@@ -149,9 +141,6 @@ def test_what_is_not_finite_changes_no_channel_that_it_meets(where, rng):
         np.testing.assert_array_equal(solved[name].numpy()[met], params[name].numpy()[met])
         if len(met) < 3:
             assert np.isfinite(np.delete(solved[name].numpy(), met, axis=0)).all()
-
-
-# ---- limits ----------------------------------------------------------------------------------------------
 
 
 def extremes(rng):

@@ -22,29 +22,24 @@ def told(feasible, target=0.2, white=1.0, lamps=0.0, **chosen):
     wanted = np.where(cover > 0, target, base)
     closest = base + feasible * (wanted - base)
     lit = np.where(cover > 0, white, 1.0) * np.ones(SHAPE)
-    reach = SimpleNamespace(
-        picture=closest,
-        residual=tonemap(wanted) - tonemap(closest),
-        share=feasible if np.isscalar(feasible) else 0.3,
-    )
+    share = feasible if np.isscalar(feasible) else 0.3
+    residual = tonemap(wanted) - tonemap(closest)
+    reach = SimpleNamespace(picture=closest, residual=residual, share=share)
     made = document({"strokes": [SQUARE, HELD], **chosen})
     painted = Request(base, wanted, cover)
     light = advice.Light(lit, np.full(SHAPE, lamps))
     return advice.said(made, painted, base, reach, [cover, cover], light)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "why", "change"),
-    [
-        ({"feasible": 0.9, "rest": "keep"}, "the rest, which stays", {"rest": "follow"}),
-        ({"feasible": 0.9, "freedom": 0.0}, "may change so little", {"freedom": 1.0}),
-        ({"feasible": 0.9, "freedom": 0.8}, "unlikely for a sky", None),
-        ({"feasible": 0.0, "target": 0.8, "white": 0.01}, "hardly any light of the map", None),
-        ({"feasible": 0.1, "lamps": 0.4}, "of lamps of the scene", None),
-        ({"feasible": 0.3}, "makes the rest darker too", "opacity"),
-        ({"feasible": 0.01}, "makes the rest darker too", None),
-    ],
-)
+@pytest.mark.parametrize(("arguments", "why", "change"), [
+    ({"feasible": 0.9, "rest": "keep"}, "the rest, which stays", {"rest": "follow"}),
+    ({"feasible": 0.9, "freedom": 0.0}, "may change so little", {"freedom": 1.0}),
+    ({"feasible": 0.9, "freedom": 0.8}, "unlikely for a sky", None),
+    ({"feasible": 0.0, "target": 0.8, "white": 0.01}, "hardly any light of the map", None),
+    ({"feasible": 0.1, "lamps": 0.4}, "of lamps of the scene", None),
+    ({"feasible": 0.3}, "makes the rest darker too", "opacity"),
+    ({"feasible": 0.01}, "makes the rest darker too", None),
+])  # fmt: skip
 def test_why_and_what_is_offered(arguments, why, change):
     text, actions = told(**arguments)
     assert text.startswith("stroke 1 (shadow) stays too") and why in text

@@ -26,40 +26,37 @@ def message(**more):
     return json.dumps({"type": "document", "document": {}} | more)
 
 
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ("", "expected JSON"),
-        ("[" * 5000, "expected JSON"),
-        ("[]", "expected document, pick, choose, open, look, sky or save"),
-        ('{"type": "run"}', "expected document, pick, choose, open, look, sky or save"),
-        (b"\x00\x01", "expected JSON text"),
-        (" " * (protocol.MOST_BYTES + 1), "at most"),
-        (message(document=3), "expected keys among"),
-        (message(document={"dir": "/"}), "expected keys among"),
-        (message(phase="later"), "expected one of drawing"),
-        (message(number=-1), "expected a count"),
-        (message(document={"exposure": float("nan")}), "expected JSON"),
-        (message(document={"exposure": 1e9}), "document.exposure"),
-        (message(document={"strokes": [{"type": "x"}]}), r"target.strokes\[0\].type"),
-        (message(document={"strokes": [{**STROKE, "width": -1}]}), r"target.strokes\[0\].width"),
-        (message(document={"strokes": [STROKE] * 501}), "expected at most 500"),
-        (message(document={"strokes": ["unread"] * 501}), "expected at most 500"),
-        (message(document={"strokes": [{**STROKE, "points": ["unread"] * 20_001}]}), "expected at most 500"),
-        (message(document={"lights": [{"light": 9}]}), r"input.lights\[0\].light"),
-        (message(document={"lights": [{"light": 1}, {"light": 1}]}), "more than once"),
-        (message(document={"lights": [{"azimuth": 1}]}), "azimuth and elevation"),
-        (message(document={"lights": [{"azimuth": 1, "elevation": 1}]}), r"input.lights\[0\].flux"),
-        (message(document={"lights": [{"light": 1, "colour": 1}]}), "has no key 'colour'"),
-        (message(document={"rest": "stays"}), "document.rest"),
-        (message(document={"freedom": 2}), "document.freedom"),
-        ('{"type": "pick", "x": 2, "y": 0}', "pick: expected a number"),
-        ('{"type": "pick", "x": 0, "y": 0, "of": "glint"}', "pick: expected"),
-        ('{"type": "pick", "x": 0, "y": 0, "point": [0, 1]}', "point: .* expected three numbers"),
-        ('{"type": "open"}', "open: expected a string"),
-        ('{"type": "open", "name": ""}', "expected a scene"),
-    ],
-)
+@pytest.mark.parametrize(("text", "said"), [
+    ("", "expected JSON"),
+    ("[" * 5000, "expected JSON"),
+    ("[]", "expected document, pick, choose, open, look, sky or save"),
+    ('{"type": "run"}', "expected document, pick, choose, open, look, sky or save"),
+    (b"\x00\x01", "expected JSON text"),
+    (" " * (protocol.MOST_BYTES + 1), "at most"),
+    (message(document=3), "expected keys among"),
+    (message(document={"dir": "/"}), "expected keys among"),
+    (message(phase="later"), "expected one of drawing"),
+    (message(number=-1), "expected a count"),
+    (message(document={"exposure": float("nan")}), "expected JSON"),
+    (message(document={"exposure": 1e9}), "document.exposure"),
+    (message(document={"strokes": [{"type": "x"}]}), r"target.strokes\[0\].type"),
+    (message(document={"strokes": [{**STROKE, "width": -1}]}), r"target.strokes\[0\].width"),
+    (message(document={"strokes": [STROKE] * 501}), "expected at most 500"),
+    (message(document={"strokes": ["unread"] * 501}), "expected at most 500"),
+    (message(document={"strokes": [{**STROKE, "points": ["unread"] * 20_001}]}), "expected at most 500"),
+    (message(document={"lights": [{"light": 9}]}), r"input.lights\[0\].light"),
+    (message(document={"lights": [{"light": 1}, {"light": 1}]}), "more than once"),
+    (message(document={"lights": [{"azimuth": 1}]}), "azimuth and elevation"),
+    (message(document={"lights": [{"azimuth": 1, "elevation": 1}]}), r"input.lights\[0\].flux"),
+    (message(document={"lights": [{"light": 1, "colour": 1}]}), "has no key 'colour'"),
+    (message(document={"rest": "stays"}), "document.rest"),
+    (message(document={"freedom": 2}), "document.freedom"),
+    ('{"type": "pick", "x": 2, "y": 0}', "pick: expected a number"),
+    ('{"type": "pick", "x": 0, "y": 0, "of": "glint"}', "pick: expected"),
+    ('{"type": "pick", "x": 0, "y": 0, "point": [0, 1]}', "point: .* expected three numbers"),
+    ('{"type": "open"}', "open: expected a string"),
+    ('{"type": "open", "name": ""}', "expected a scene"),
+])  # fmt: skip
 def test_bad_messages_are_refused_with_what_was_expected(text, said):
     with pytest.raises(protocol.BadMessageError, match=said):
         protocol.read(text)
@@ -110,13 +107,11 @@ def test_a_frame_holds_half_floats_and_nothing_that_is_not_finite():
 
 def test_painted_toml_is_what_was_given_and_what_was_painted(tmp_path):
     file = tmp_path / "edit.toml"
-    file.write_text(
-        'seed = 4\n[input]\nenvmap = "sunsky"\nwidth = 64\n[scene]\nfile = "pair"\n[target]\nhold = 2\n'
-    )
+    text = 'seed = 4\n[input]\nenvmap = "sunsky"\nwidth = 64\n[scene]\nfile = "pair"\n'
+    file.write_text(text + "[target]\nhold = 2\n")
     opened = project.opened(str(file))
-    assert (
-        opened.document == protocol.Document() and opened.folder == tmp_path / "edit_out" and not opened.again
-    )
+    assert opened.document == protocol.Document() and not opened.again
+    assert opened.folder == tmp_path / "edit_out"
     light = {"azimuth": 10.0, "elevation": 20.0, "flux": [1, 2, 3], "role": "rim"}
     done = protocol.document(
         {"strokes": [STROKE], "lights": [light], "rotate_degrees": 30, "exposure": 0.5, "temperature": 5000}

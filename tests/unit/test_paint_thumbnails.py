@@ -14,7 +14,6 @@ from envedit.images import images
 
 
 def made(files, seconds=60):
-    """Return the pictures of files, as they come."""
     told, done = {}, threading.Event()
 
     def say(message):

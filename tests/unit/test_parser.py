@@ -10,13 +10,10 @@ from envedit.core.errors import ConfigError, InputError
 from envedit.scene import parser, scene
 from tests.oracles.builders import BALL, LIGHT, SENSOR, sky, write_scene
 
-# ---- film, environment, smooth limit -----------------------------------------------------------------------
 
-
-@pytest.mark.parametrize(
-    "asked, size",
-    [({}, (16, 12)), ({"width": 32}, (32, 24)), ({"height": 6}, (8, 6)), ({"width": 5, "height": 7}, (5, 7))],
-)
+@pytest.mark.parametrize("asked, size", [
+    ({}, (16, 12)), ({"width": 32}, (32, 24)), ({"height": 6}, (8, 6)), ({"width": 5, "height": 7}, (5, 7)),
+])  # fmt: skip
 def test_film_size(tmp_path, asked, size):
     loaded = scene.load(write_scene(tmp_path, SENSOR, BALL, LIGHT), **asked)
     assert (loaded.width, loaded.height) == size
@@ -92,9 +89,6 @@ def test_zero_roughness_is_the_mirror(rng):
     assert np.array_equal(smooth, scene.load("mirror", width=16).render(image, spp=16))
 
 
-# ---- fit to the stage --------------------------------------------------------------------------------------
-
-
 def box_obj(path, size):
     corners = [[x, y, z] for x in (0, size[0]) for y in (0, size[1]) for z in (0, size[2])]
     faces = ["1 2 4 3", "5 7 8 6", "1 5 6 2", "3 4 8 7", "1 3 7 5", "2 6 8 4"]
@@ -102,11 +96,10 @@ def box_obj(path, size):
     return path
 
 
-@pytest.mark.parametrize(
-    "up, size, expected",
-    [("y", (1, 4, 2), (0.5, 2, 1)), ("z", (1, 2, 4), (0.5, 2, 1)), ("-x", (10, 5, 2.5), (1, 2, 0.5)),
-     ("y", (30, 1, 3), (3, 0.1, 0.3)), ("-y", (1, 1, 1), (2, 2, 2)), ("-z", (1, 2, 1e-3), (1.5, 1.5e-3, 3))],
-)  # fmt: skip
+@pytest.mark.parametrize("up, size, expected", [
+    ("y", (1, 4, 2), (0.5, 2, 1)), ("z", (1, 2, 4), (0.5, 2, 1)), ("-x", (10, 5, 2.5), (1, 2, 0.5)),
+    ("y", (30, 1, 3), (3, 0.1, 0.3)), ("-y", (1, 1, 1), (2, 2, 2)), ("-z", (1, 2, 1e-3), (1.5, 1.5e-3, 3)),
+])  # fmt: skip
 def test_a_mesh_is_fitted_to_the_stage(tmp_path, up, size, expected):
     path = box_obj(tmp_path / "box.OBJ", size)
     loaded = scene.load("mesh", width=8, parameters={"mesh": path.name, "up": up}, base=tmp_path)
@@ -145,9 +138,6 @@ def test_a_mesh_that_cannot_stand_is_refused(tmp_path):
 def test_real_meshes_load(data, name, up):
     loaded = scene.load("mesh", width=8, parameters={"mesh": data / "meshes" / name, "up": up})
     assert loaded.render(np.ones((8, 16, 3)), spp=4).max() < 1.5
-
-
-# ---- digest ------------------------------------------------------------------------------------------------
 
 
 def test_digest_follows_what_the_rendering_depends_on(tmp_path):

@@ -13,10 +13,13 @@ def pictures(rng, noise=0.003):
     return [base + noise * rng.normal(size=SHAPE) for _ in range(2)], base
 
 
-def test_equal_pictures_are_trusted(rng):
+def test_equal_pictures_and_noise_alone_are_trusted(rng):
     (_, _), base = pictures(rng)
     assert pixel_confidence.weights(base, base, 1 / 8, base) is None
     assert pixel_confidence.weights(base, base, 1 / 8, base, np.zeros(SHAPE[:2])) is None
+    base = np.full(SHAPE, 0.5)
+    both = [base + rng.random(SHAPE) for _ in range(2)]
+    assert pixel_confidence.weights(*both, 1 / 8, base) is None
 
 
 @pytest.mark.parametrize("noise", [0.003, 0.03])
@@ -34,14 +37,11 @@ def test_a_caustic_counts_less_and_the_rest_as_before(rng):
     assert found[:, :16].min() > 0.99
 
 
-def test_a_second_recording_of_more_samples_leaves_more_of_the_noise_to_the_first(rng):
+def test_more_samples_leave_more_noise_to_the_first_and_the_target_s_own_counts(rng):
     (first, second), base = pictures(rng)
     first[10:13, 20:23] += 0.1
     few, many = (pixel_confidence.weights(first, second, share, base) for share in (1 / 2, 2))
     assert many[11, 21] < few[11, 21] < 0.5
-
-
-def test_the_target_s_own_noise_counts_too(rng):
     (first, second), base = pictures(rng)
     noise = np.full(SHAPE[:2], 0.002)
     noise[4, 5] = 0.5
@@ -93,12 +93,6 @@ def test_radiance_at_the_extremes_is_finite(rng):
     first[5, 5], second[6, 6], first[8, 8] = 3e38, 0, 1e-30
     found = pixel_confidence.weights(first, second, 1 / 8, base)
     assert np.isfinite(found).all() and found.min() >= 0 and found.max() <= 1
-
-
-def test_a_picture_of_noise_alone_is_trusted_as_a_whole(rng):
-    base = np.full(SHAPE, 0.5)
-    both = [base + rng.random(SHAPE) for _ in range(2)]
-    assert pixel_confidence.weights(*both, 1 / 8, base) is None
 
 
 def test_noise_at_the_edge_of_a_view_says_nothing_of_the_next(rng):

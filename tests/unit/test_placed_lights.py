@@ -11,15 +11,9 @@ from envedit.core.errors import ConfigError, InputError
 from envedit.core.rotations import Orientation
 from envedit.images import images
 from envedit.maps.adjusted import Adjustments, adjusted
+from envedit.representations.layers import placed_lights
 from envedit.representations.layers.oriented import oriented
-from envedit.representations.layers.placed_lights import (
-    PlacedLights,
-    add,
-    angles,
-    direction,
-    missing,
-    profile,
-)
+from envedit.representations.layers.placed_lights import PlacedLights, add, angles, direction
 from tests.oracles.devices import on_cpu
 from tests.oracles.maps import flux
 from tests.oracles.runs import DARKER, at_both_resolutions
@@ -38,13 +32,10 @@ def test_directions_and_angles_are_inverse():
     assert (row, column) == (pytest.approx(45 / 180 * 31), pytest.approx(90 / 360 * 64 - 0.5))
 
 
-def test_nothing_asked_changes_no_bit(sky):
+def test_nothing_asked_changes_no_bit_and_a_map_is_levelled_as_by_envedit_adjust(sky):
     assert PlacedLights(sky).place([]) is sky
     same = PlacedLights(sky).place([{"light": 1, "flux": [1.0] * 3, "size": 1.0}])
     assert np.array_equal(same, sky)
-
-
-def test_a_map_is_levelled_as_envedit_adjust_levels_it(sky):
     keys = {"rotate_degrees": 100.0, "tilt_degrees": 8.0, "horizon_degrees": -5.0}
     levelled = inputs.read_map(config.Input(envmap="sunsky", width=64, **keys), None, 64)
     expected, _ = adjusted(sky, Adjustments(turn=100.0, tilt=8.0, horizon=-5.0))
@@ -129,9 +120,10 @@ def test_rotation_turns_a_shape_to_the_left_and_softness_moves_no_border(elevati
             placed = light | {"rotation": rotation, "softness": softness}
             for axis, half in ((longer, 20.0), (shorter, 5.0)):
                 angle = np.radians([half - 0.01, half + 0.01])[:, None]
-                border = profile(placed, np.cos(angle) * toward + np.sin(angle) * axis, np.radians(0.2))
+                around = np.cos(angle) * toward + np.sin(angle) * axis
+                border = placed_lights.profile(placed, around, np.radians(0.2))
                 assert border.mean() == pytest.approx(0.5, abs=0.02)
-                assert (profile(placed, toward, np.radians(0.2)) == 1).all()
+                assert (placed_lights.profile(placed, toward, np.radians(0.2)) == 1).all()
 
 
 @pytest.mark.parametrize("tall", [False, True])
@@ -177,7 +169,10 @@ def test_images_that_cannot_be_on_a_light_are_named(tmp_path):
 def test_what_the_map_does_not_have_is_told(sky):
     settings = config.Input(envmap="sunsky", width=64, lights=[{"light": 5, "flux": [0, 0, 0]}])
     given = inputs.read_map(settings, None, 64)
-    assert missing(settings.lights, 1) == [5] and "got light = 5, but the map has" in given.warnings[-1]
+    assert (
+        placed_lights.missing(settings.lights, 1) == [5]
+        and "got light = 5, but the map has" in given.warnings[-1]
+    )
     assert np.array_equal(given.radiance, sky)
     two = config.Input(envmap="sunsky", width=64, lights=[{"light": k, "flux": [0, 0, 0]} for k in (5, 7)])
     assert "got light = 5, 7, but" in inputs.read_map(two, None, 64).warnings[-1]

@@ -10,9 +10,8 @@ from envedit.scene.camera_paths import NoPlaceError
 from tests.oracles.builders import AHEAD, LIGHT, RIGHT, SENSOR, UP, write_scene
 from tests.unit.test_shadow import FLOOR, SMALL_BALL, on_picture
 
-TURNED = LIGHT.replace(
-    "</emitter>", '<transform name="to_world"><rotate y="1" angle="70"/></transform></emitter>'
-)
+TURN = '<transform name="to_world"><rotate y="1" angle="70"/></transform>'
+TURNED = LIGHT.replace("</emitter>", f"{TURN}</emitter>")
 EYE = -AHEAD
 FLOOR_POINT = np.array([0.9, -1.0, 0.5])
 

@@ -8,8 +8,6 @@ from envedit import config as cfg
 from envedit.config import presets
 from envedit.core.errors import ConfigError
 
-# ---- presets -----------------------------------------------------------------------------------------------
-
 
 def test_the_paper_preset_is_section_6():
     paper = cfg.loads("", preset="paper")
@@ -35,43 +33,31 @@ def test_the_paper_preset_spells_out_every_number_of_the_method():
         assert set(presets.PRESETS["paper"][table]) == keys - left_out, table
 
 
-# ---- precedence --------------------------------------------------------------------------------------------
-
-
-def test_default_then_preset_then_file_then_override():
+def test_default_then_preset_then_file_then_override_key_by_key():
     assert cfg.loads("").fit.epochs == 1200
     assert cfg.loads('preset = "draft"').fit.epochs == 500
     assert cfg.loads('preset = "draft"\n[fit]\nepochs = 7').fit.epochs == 7
     assert cfg.loads('preset = "draft"\n[fit]\nepochs = 7', overrides=["fit.epochs=8"]).fit.epochs == 8
     assert cfg.loads("", overrides=["fit.epochs=8", "fit.epochs=9"]).fit.epochs == 9
 
-
-def test_the_preset_argument_beats_override_beats_file():
+    # And the argument before an override of the preset.
     assert cfg.loads('preset = "draft"', overrides=["preset=paper"]).preset == "paper"
     config = cfg.loads('preset = "draft"', preset="standard", overrides=["preset=paper"])
     assert config.preset == "standard" and config.fit.epochs == 1200
-
-
-def test_scene_parameters_are_merged_key_by_key():
     config = cfg.loads("[scene.parameters]\na = 1\nb = true", overrides=["scene.parameters.a=glossy"])
     assert config.scene.parameters == {"a": "glossy", "b": True}
 
 
-# ---- defaults of a kind of representation ----------------------------------------------------------------
-
 MANY = ("siren", "pixels", "log-pixels")
 
 
-@pytest.mark.parametrize(
-    ("preset", "kind", "ssim", "iterations"),
-    [
-        ("standard", "layers", 0.1, 100),
-        ("draft", "layers", 0.1, 100),
-        *(("standard", kind, 1.0, "auto" if kind == "siren" else 600) for kind in MANY),
-        *(("draft", kind, 1.0, 150) for kind in MANY),
-        *(("paper", kind, (1.0, 1e4), 400) for kind in ("layers", *MANY)),
-    ],
-)
+@pytest.mark.parametrize(("preset", "kind", "ssim", "iterations"), [
+    ("standard", "layers", 0.1, 100),
+    ("draft", "layers", 0.1, 100),
+    *(("standard", kind, 1.0, "auto" if kind == "siren" else 600) for kind in MANY),
+    *(("draft", kind, 1.0, 150) for kind in MANY),
+    *(("paper", kind, (1.0, 1e4), 400) for kind in ("layers", *MANY)),
+])  # fmt: skip
 def test_loss_and_length_suit_the_kind(preset, kind, ssim, iterations):
     given = [
         cfg.loads(f'preset = "{preset}"\n[representation]\nkind = "{kind}"'),
@@ -83,15 +69,12 @@ def test_loss_and_length_suit_the_kind(preset, kind, ssim, iterations):
         assert (config.loss.ssim, config.optimizer.iterations) == (ssim, iterations)
 
 
-def test_the_kind_that_counts_is_the_last_one_given():
+def test_the_last_kind_counts_and_file_and_override_beat_its_defaults_key_by_key():
     text = '[representation]\nkind = "siren"'
     assert cfg.loads(text).optimizer.iterations == "auto"
     assert cfg.loads(text, overrides=["representation.kind=layers"]).optimizer.iterations == 100
     assert cfg.loads(text, overrides=["representation.kind=pixels"]).loss.ssim == 1.0
     assert cfg.loads("", preset="paper").representation.kind == "siren"
-
-
-def test_file_and_override_beat_the_defaults_of_a_kind_key_by_key():
     text = 'preset = "draft"\n[representation]\nkind = "pixels"\n[optimizer]\niterations = 7'
     config = cfg.loads(text)
     assert (config.optimizer.iterations, config.loss.ssim) == (7, 1.0)
@@ -106,26 +89,13 @@ def test_file_and_override_beat_the_defaults_of_a_kind_key_by_key():
 
 def test_dists_is_left_to_the_weights_for_a_siren_alone():
     for preset in ("draft", "standard"):
-        found = {kind: cfg.loads("", preset, overrides=[f"representation.kind={kind}"]) for kind in MANY}
-        assert {kind: one.loss.dists for kind, one in found.items()} == dict.fromkeys(MANY, 0.0) | {
-            "siren": "auto"
-        }
+        found = [cfg.loads("", preset, overrides=[f"representation.kind={kind}"]) for kind in MANY]
+        assert [one.loss.dists for one in found] == ["auto", 0.0, 0.0]
     paper = cfg.loads("", preset="paper")
     assert (paper.loss.dists, paper.optimizer.iterations) == (0.6, 400)
 
 
-def test_a_kind_that_is_none_is_refused_by_its_own_key():
-    for value in ("3", "[1]", '"network"'):
-        with pytest.raises(ConfigError, match="representation.kind"):
-            cfg.loads(f"[representation]\nkind = {value}")
-    with pytest.raises(ConfigError, match="representation"):
-        cfg.loads("representation = 3")
-
-
-# ---- targets -----------------------------------------------------------------------------------------------
-
-
-def test_a_target_file_changes_no_other_key():
+def test_a_target_is_a_file_or_a_turn_and_the_last_one_given_counts():
     for config in (cfg.loads(""), cfg.loads("[target]\nfile = 'b.exr'")):
         assert config.target.rotate_degrees == "auto"
     assert cfg.Target().degrees == 60 and cfg.Target(rotate_degrees=5).degrees == 5
@@ -137,12 +107,8 @@ def test_a_target_file_changes_no_other_key():
         dataclasses.replace(cfg.Target(rotate_degrees=5), file="/b.exr")
     painted = cfg.loads("[target]\nkind = 'image'\nfile = '/b.exr'\nrotate_degrees = 5")
     assert painted.target.file == "/b.exr" and painted.target.rotate_degrees == 5
-    assert cfg.unused(painted) == [
-        'target.rotate_degrees: no effect: needs target.kind = "envmap", got "image"'
-    ]
-
-
-def test_a_map_that_overrides_a_turn_replaces_it_and_the_other_way_round():
+    (said,) = cfg.unused(painted)
+    assert said.startswith("target.rotate_degrees: no effect: needs target.kind")
     turned = cfg.loads("[target]\nfile = 'b.exr'", overrides=["target.rotate_degrees=5"]).target
     assert turned.file == "" and turned.rotate_degrees == 5
     for still in ("0", "auto"):
@@ -156,26 +122,16 @@ def test_a_map_that_overrides_a_turn_replaces_it_and_the_other_way_round():
         assert cleared.file == "" and cleared.rotate_degrees == "auto"
 
 
-# ---- files and paths ---------------------------------------------------------------------------------------
-
-
-def test_paths_are_relative_to_the_file(tmp_path, here):
+def test_paths_are_relative_to_the_file_and_names_that_are_no_paths_stay(tmp_path, here):
     folder = tmp_path / "project"
     folder.mkdir()
-    text = (
-        "[input]\nenvmap = 'maps/sky.exr'\n[scene]\nfile = 'room.xml'\n"
-        "[target]\nkind = 'image'\nfile = '/abs/t.png'\nmask = 'm.png'\n"
-    )
+    text = "[input]\nenvmap = 'maps/sky.exr'\n[scene]\nfile = 'room.xml'\n"
+    text += "[target]\nkind = 'image'\nfile = '/abs/t.png'\nmask = 'm.png'\n"
     (folder / "edit.v2.toml").write_bytes(b"\xef\xbb\xbf" + text.replace("\n", "\r\n").encode())
     config = cfg.load("project/edit.v2.toml", overrides=["target.mask=n.png"])
     assert config.input.envmap == str(folder / "maps/sky.exr")
-    assert config.scene.file == str(folder / "room.xml")
-    assert config.target.file == "/abs/t.png"
-    assert config.target.mask == str(folder / "n.png")
-    assert config.output.dir == str(folder / "edit.v2_out")
-
-
-def test_names_that_are_no_paths_stay():
+    assert config.scene.file == str(folder / "room.xml") and config.target.file == "/abs/t.png"
+    assert config.target.mask == str(folder / "n.png") and config.output.dir == str(folder / "edit.v2_out")
     config = cfg.loads("[scene]\nfile = 'mirror'", base_dir="/d")
     assert config.scene.file == "mirror" and config.input.envmap == "auto" and config.target.file == ""
     config = cfg.loads("[scene]\nfile = './mirror'\n[input]\nenvmap = './sunsky'", base_dir="/d")

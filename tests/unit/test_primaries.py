@@ -18,16 +18,13 @@ from tests.oracles.devices import on_cpu
 from tests.oracles.runs import TINY, call, changed, pixels
 
 
-@pytest.mark.parametrize(
-    "space, expected",
-    [
-        # IEC 61966-2-1; ITU-R BT.2020; SMPTE ST 2065-1; Academy S-2014-004.
-        (REC709, [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]),
-        (REC2020, [[0.6370, 0.1446, 0.1689], [0.2627, 0.6780, 0.0593], [0.0, 0.0281, 1.0610]]),
-        (ACES_AP0, [[0.95255, 0, 0.00009], [0.34397, 0.72817, -0.07213], [0, 0, 1.00883]]),
-        (ACES_AP1, [[0.66245, 0.13400, 0.15619], [0.27223, 0.67408, 0.05369], [-0.00557, 0.00406, 1.01034]]),
-    ],
-)
+@pytest.mark.parametrize("space, expected", [
+    # IEC 61966-2-1; ITU-R BT.2020; SMPTE ST 2065-1; Academy S-2014-004.
+    (REC709, [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]),
+    (REC2020, [[0.6370, 0.1446, 0.1689], [0.2627, 0.6780, 0.0593], [0.0, 0.0281, 1.0610]]),
+    (ACES_AP0, [[0.95255, 0, 0.00009], [0.34397, 0.72817, -0.07213], [0, 0, 1.00883]]),
+    (ACES_AP1, [[0.66245, 0.13400, 0.15619], [0.27223, 0.67408, 0.05369], [-0.00557, 0.00406, 1.01034]]),
+])  # fmt: skip
 def test_matrices_to_xyz_are_the_published_ones(space, expected):
     np.testing.assert_allclose(primaries.rgb_to_xyz(space), expected, atol=6e-5)
 
@@ -85,10 +82,9 @@ def test_a_name_that_says_nothing_is_none(key, name, tmp_path, rng):
     assert not images.read(same)[1]["warnings"]
 
 
-@pytest.mark.parametrize(
-    "header",
-    [{}, {"oiio:ColorSpace": "ARRI LogC"}, {"chromaticities": REC2020}, {"chromaticities": (0.3,) * 8}],
-)
+@pytest.mark.parametrize("header", [
+    {}, {"oiio:ColorSpace": "ARRI LogC"}, {"chromaticities": REC2020}, {"chromaticities": (0.3,) * 8},
+])  # fmt: skip
 def test_a_key_goes_before_what_the_file_says(header, tmp_path, rng):
     """The map is converted from, and written in, the space that [input] colour_space names."""
     p = planes(rng)
@@ -104,16 +100,13 @@ def test_a_key_goes_before_what_the_file_says(header, tmp_path, rng):
     assert plain.chromaticities is None and (plain.radiance == stacked(p)).all()
 
 
-@pytest.mark.parametrize(
-    "space",
-    [
-        (0.64, 0.33, 0.64, 0.33, 0.15, 0.06, 0.3127, 0.3290),  # two are the same
-        (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.9, 0.05),  # a white that no mixture of them is
-        (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3, 0.0),
-        (float("nan"),) * 8,
-        (0.0, 1e17, 0.0, 2e17, 1e17, 0.0, 0.3, 0.3),  # beside which white is nothing: singular
-    ],
-)
+@pytest.mark.parametrize("space", [
+    (0.64, 0.33, 0.64, 0.33, 0.15, 0.06, 0.3127, 0.3290),  # two are the same
+    (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.9, 0.05),  # a white that no mixture of them is
+    (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3, 0.0),
+    (float("nan"),) * 8,
+    (0.0, 1e17, 0.0, 2e17, 1e17, 0.0, 0.3, 0.3),  # beside which white is nothing: singular
+])  # fmt: skip
 def test_chromaticities_that_are_no_primaries_are_refused(space, tmp_path, rng):
     with pytest.raises(InputError, match="a.exr: its chromaticities .* are no primaries"):
         images.read(exr(tmp_path / "a.exr", {"chromaticities": space}, **planes(rng)))

@@ -36,9 +36,6 @@ def test_a_log_gets_a_line_a_stage_and_one_now_and_then(clock):
     # 25 seconds are five times five; 4 parts a second.
     lines = [f"fitting: {done}/100, 4/s loss {done}" for done in (20, 40, 60, 80, 100)]
     assert stream.getvalue().splitlines() == ["fitting", *lines, "editing"]
-
-
-def test_a_line_in_a_log_holds_no_control_characters_or_blanks_at_its_end(clock):
     stream = io.StringIO()
     with contextlib.redirect_stderr(stream), Progress() as shown:
         shown.stage("tracing")
@@ -107,10 +104,3 @@ def test_a_bar_is_closed_when_the_run_fails():
         shown.update(1, 4)
         raise KeyError
     assert shown._bar is None
-
-
-def test_it_speaks_on_the_error_stream(capsys):
-    with Progress() as shown:
-        shown.stage("editing")
-    captured = capsys.readouterr()
-    assert captured.out == "" and captured.err == "editing\n"

@@ -12,6 +12,7 @@ from envedit.scene import scene
 from envedit.transport import recording
 from envedit.transport.light_transport import LightTransport
 from envedit.transport.texel_sampling import Grid
+from tests.oracles.scenes import WHITE, ball, stage
 
 NAN, INF = float("nan"), float("inf")
 
@@ -36,9 +37,6 @@ def test_contributions_that_are_not_finite_are_left_out_and_counted(monkeypatch)
     np.testing.assert_array_equal(got.pixels, [0, 7])
     np.testing.assert_array_equal(got.texels, [0, 7])
     np.testing.assert_allclose(got.weights, [(2, 3, 4), (0, 0, 1e-30)], rtol=1e-6)
-
-
-def test_nothing_but_non_finite_contributions_is_an_empty_record(monkeypatch):
     got = record(monkeypatch, batch((NAN, NAN, NAN), (INF, INF, INF)))
     assert got.lost == 2 and got.weights.shape == (0, 3) and len(got.pixels) == len(got.texels) == 0
 
@@ -91,14 +89,9 @@ def test_depth_error_is_the_share_of_a_rendering_without_bound():
     eye = mi.ScalarTransform4d().look_at([0, 0, 0], [1, 0, 0], [0, 1, 0])
     film = {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}}
     white = {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": 0.9}}
-    s = scene.load(
-        {
-            "type": "scene",
-            "sensor": {"type": "perspective", "fov": 90, "to_world": eye, "film": film},
-            "tube": {"type": "cylinder", "p0": [0, 0, -2], "p1": [0, 0, 2], "radius": 1, "bsdf": white},
-            "sky": {"type": "constant"},
-        }
-    )
+    tube = {"type": "cylinder", "p0": [0, 0, -2], "p1": [0, 0, 2], "radius": 1, "bsdf": white}
+    sensor = {"type": "perspective", "fov": 90, "to_world": eye, "film": film}
+    s = scene.load({"type": "scene", "sensor": sensor, "tube": tube, "sky": {"type": "constant"}})
     white = np.ones((4, 8, 3), np.float32)
     whole = s.render(white, spp=1024, max_depth=-1).mean(dtype=np.float64)
     for asked, depth in (("auto", recording.MAX_BOUNCES + 1), (3, 3)):
@@ -133,18 +126,8 @@ def test_an_index_into_the_exact_columns_fits_into_32_bits(size):
 
 @pytest.mark.slow
 def test_light_of_lamps_is_cut_only_where_a_path_depth_is_asked_for():
-    eye = mi.ScalarTransform4d().look_at([0, 2, 5], [0, 0, 0], [0, 1, 0])
-    film = {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": "box"}}
-    s = scene.load(
-        {
-            "type": "scene",
-            "sensor": {"type": "perspective", "to_world": eye, "film": film},
-            "floor": {"type": "rectangle", "to_world": mi.ScalarTransform4d().rotate([1, 0, 0], -90)},
-            "ball": {"type": "sphere", "radius": 0.5},
-            "lamp": {"type": "point", "position": [0, 2, 2]},
-            "sky": {"type": "constant"},
-        }
-    )
+    lamp = {"type": "point", "position": [0, 2, 2]}
+    s = scene.load(stage(ball(WHITE), film={"width": 8, "height": 8}) | {"lamp": lamp})
     black = dr.zeros(mi.TensorXf, (4, 8, 3))
     for asked, depth in (("auto", -1), (2, 2)):
         t = LightTransport.build(s, 4, 8, spp=4, max_depth=asked, memory_gb=0.1, seed=3)

@@ -34,7 +34,6 @@ def tell(sphere, picture):
 
 
 def eight_bit(picture):
-    """Return a picture as it comes back from a PNG."""
     shown = np.round(np.clip(picture, 0, 1) ** (1 / 2.2) * 255) / 255
     return inverse_tonemap(shown, "gamma").astype(np.float32)
 
@@ -74,20 +73,14 @@ def test_without_noise_it_was_not_painted_on_the_rendering(sphere):
     assert tell(sphere, lit.render(np.roll(envmap, 5, axis=1), spp=529, seed=7))[0]
 
 
-def test_where_part_of_it_is_the_rendering_it_was_painted(sphere):
+def test_what_is_the_rendering_in_part_or_black_was_painted(sphere):
     """No other rendering is asked for."""
     picture = np.roll(sphere[3], 3, axis=0)
     picture[:16] = sphere[2][:16]
     assert tell(sphere, picture) == (False, 0)
     assert tell(sphere, sphere[2]) == (False, 0)
-
-
-def test_black_renderings_say_nothing(sphere):
     black = np.zeros((*FILM, 3), np.float32)
     assert not rendered_anew.is_rendered_anew(black + 1, black, np.ones((*FILM, 1)), lambda: black)
-
-
-# ---- noise -------------------------------------------------------------------------------------------------
 
 
 def noisy(rng, sigma, shape=(64, 96), views=1):
@@ -102,8 +95,7 @@ def noisy(rng, sigma, shape=(64, 96), views=1):
 @pytest.mark.parametrize("sigma", [0.003, 0.01, 0.03])
 def test_noise_over_a_gradient_is_found(sigma, rng):
     found = rendered_anew.noise(noisy(rng, sigma))
-    assert found.shape == (64, 96) and np.ptp(found) == 0
-    assert found[0, 0] == pytest.approx(sigma, rel=0.1)
+    assert found.shape == (64, 96) and np.ptp(found) == 0 and found[0, 0] == pytest.approx(sigma, rel=0.1)
 
 
 def test_edges_are_little_of_it_and_views_are_apart(rng):

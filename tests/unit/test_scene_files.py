@@ -170,8 +170,6 @@ def test_a_sparse_file_of_5_gb_and_a_pipe_are_not_read(tmp_path):
 
 
 # ---- the other process -------------------------------------------------------------------------------------
-
-
 def stand_in(folder, monkeypatch, script):
     """Put a script in place of Python in the other process."""
     (folder / "python").write_text(f"#!/bin/sh\n{script}\n")

@@ -20,13 +20,10 @@ def refused(path, says, **parameters):
     return message
 
 
-def nested(depth, tag="bsdf", kind="twosided"):
-    return f'<{tag} type="{kind}">' * depth + f"</{tag}>" * depth
-
-
 @pytest.mark.parametrize("depth", [scene_text.DEEPEST + 1, 3_000, 20_000])
 def test_deeply_nested_elements_are_refused(tmp_path, depth):
-    refused(write_scene(tmp_path, SENSOR, LIGHT, nested(depth)), r"line \d+: more than 20 elements inside")
+    nested = '<bsdf type="twosided">' * depth + "</bsdf>" * depth
+    refused(write_scene(tmp_path, SENSOR, LIGHT, nested), r"line \d+: more than 20 elements inside")
 
 
 @pytest.mark.slow
@@ -40,23 +37,17 @@ def test_a_long_chain_of_references_is_refused_and_a_short_one_is_not(tmp_path):
 
 
 def test_references_in_a_circle_are_refused(tmp_path):
-    parts = (
-        '<bsdf type="twosided" id="a"><ref id="b"/></bsdf>',
-        '<bsdf type="twosided" id="b"><ref id="a"/></bsdf>',
-    )
+    parts = [f'<bsdf type="twosided" id="{one}"><ref id="{other}"/></bsdf>' for one, other in ("ab", "ba")]
     refused(write_scene(tmp_path, SENSOR, LIGHT, *parts), "refer to one another in a circle")
 
 
-@pytest.mark.parametrize(
-    "part, says",
-    [
-        ('<bsdf type="blendbsdf"/>', "blendbsdf has no weight"),
-        ('<bsdf type="BlendBSDF" id="b"><bsdf type="diffuse"/></bsdf>', "blendbsdf has no weight"),
-        ('<bsdf type="normalmap"><bsdf type="diffuse"/></bsdf>', "normalmap has no normalmap"),
-        ('<emitter type="spot"><texture name="texture" type="bitmap"/></emitter>', "bitmap has no filename"),
-        ('<texture type="bitmap"><float name="filename" value="2"/></texture>', "filename is 2"),
-    ],
-)
+@pytest.mark.parametrize("part, says", [
+    ('<bsdf type="blendbsdf"/>', "blendbsdf has no weight"),
+    ('<bsdf type="BlendBSDF" id="b"><bsdf type="diffuse"/></bsdf>', "blendbsdf has no weight"),
+    ('<bsdf type="normalmap"><bsdf type="diffuse"/></bsdf>', "normalmap has no normalmap"),
+    ('<emitter type="spot"><texture name="texture" type="bitmap"/></emitter>', "bitmap has no filename"),
+    ('<texture type="bitmap"><float name="filename" value="2"/></texture>', "filename is 2"),
+])  # fmt: skip
 def test_what_mitsuba_reads_without_looking_must_be_there(tmp_path, part, says):
     refused(write_scene(tmp_path, SENSOR, LIGHT, part), says)
 

@@ -19,38 +19,18 @@ quick = settings(deadline=None, max_examples=150, suppress_health_check=[HealthC
 
 KINDS = ("layers", "siren", "pixels", "log-pixels")
 
+
 # ---- defaults ----------------------------------------------------------------------------------------------
-
-
 def test_an_empty_file_gives_the_defaults():
     config = cfg.loads("")
-    assert config.preset == "standard" and config.seed == 0 and config.variant == "llvm_ad_rgb"
-    assert config == dataclasses.replace(cfg.Config(), output=config.output)
-    assert config.input == cfg.Input(envmap="auto", width=256, rows="all")
-    assert config.fit.lr == 1e-3 and config.renderer.spp == "auto"
-    assert config.representation.kind == "layers" and config.representation.cycles == "auto"
-    assert config.loss.ssim == 0.1 and config.optimizer.iterations == 100
-    assert config.optimizer.lr == "auto" and cfg.loads("[optimizer]\nlr = 1e-3").optimizer.lr == 1e-3
-
-
-def test_every_key_says_what_it_means():
-    for f in dataclasses.fields(cfg.Fit):
-        assert f.metadata["doc"] and f"{f.name} : " in cfg.Fit.__doc__
-    assert "turbidity : float" in cfg.Input.__doc__ and "variant : str" in cfg.Config.__doc__
-
-
-@pytest.mark.parametrize("solver", ["auto", "gauss-newton", "adam"])
-def test_layers_through_a_transport_take_every_solver(solver):
-    assert cfg.loads("").optimizer.kind == "auto"
-    config = cfg.loads(f'[optimizer]\nkind = "{solver}"')
-    assert config.optimizer.kind == solver
-    assert cfg.loads(cfg.to_toml(config)).optimizer.kind == solver
+    assert config.preset == "standard" and config == dataclasses.replace(cfg.Config(), output=config.output)
 
 
 @pytest.mark.parametrize(
     "tables", [f"[representation]\nkind = '{kind}'" for kind in KINDS[1:]] + ["[renderer]\nkind = 'path'"]
 )
 def test_gauss_newton_without_layers_or_a_transport_is_refused(tables):
+    assert cfg.loads("[optimizer]\nkind = 'gauss-newton'").optimizer.kind == "gauss-newton"
     message = refused(tables + "\n[optimizer]\nkind = 'gauss-newton'")
     assert "optimizer.kind" in message and "expected adam or auto" in message
     for solver in ("auto", "adam"):
@@ -60,24 +40,19 @@ def test_gauss_newton_without_layers_or_a_transport_is_refused(tables):
 
 
 # ---- overrides ---------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    "text, keys, value",
-    [
-        ("fit.epochs=10", ("fit", "epochs"), 10),
-        ("seed = 3", ("seed",), 3),
-        ("input.envmap=maps/a b.exr", ("input", "envmap"), "maps/a b.exr"),
-        ('input.envmap="a=b"', ("input", "envmap"), "a=b"),
-        ("loss.ssim=[1, 1e4]", ("loss", "ssim"), [1, 1e4]),
-        ("renderer.spp=auto", ("renderer", "spp"), "auto"),
-        ("output.report=false", ("output", "report"), False),
-        ("output.dir=", ("output", "dir"), ""),
-        ("scene.parameters.roughness=0.5", ("scene", "parameters", "roughness"), 0.5),
-        ("fit.epochs=1\nseed=2", ("fit", "epochs"), "1\nseed=2"),
-        ("seed=0x", ("seed",), "0x"),
-    ],
-)
+@pytest.mark.parametrize("text, keys, value", [
+    ("fit.epochs=10", ("fit", "epochs"), 10),
+    ("seed = 3", ("seed",), 3),
+    ("input.envmap=maps/a b.exr", ("input", "envmap"), "maps/a b.exr"),
+    ('input.envmap="a=b"', ("input", "envmap"), "a=b"),
+    ("loss.ssim=[1, 1e4]", ("loss", "ssim"), [1, 1e4]),
+    ("renderer.spp=auto", ("renderer", "spp"), "auto"),
+    ("output.report=false", ("output", "report"), False),
+    ("output.dir=", ("output", "dir"), ""),
+    ("scene.parameters.roughness=0.5", ("scene", "parameters", "roughness"), 0.5),
+    ("fit.epochs=1\nseed=2", ("fit", "epochs"), "1\nseed=2"),
+    ("seed=0x", ("seed",), "0x"),
+])  # fmt: skip
 def test_overrides_are_toml_or_bare_words(text, keys, value):
     assert reading.parse_override(text) == (keys, value)
 
@@ -89,46 +64,41 @@ def test_an_override_without_key_or_value_is_refused(text):
 
 
 # ---- refusals ----------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    "text, parts",
-    [
-        ("[fit]\nepoch = 3", ["a.toml", "[fit] has no key epoch", "did you mean epochs?"]),
-        ("epochs = 3", ["unknown table or key epochs", "did you mean fit.epochs?"]),
-        ("[ouput]\ndir = 'x'", ["unknown table or key ouput", "did you mean output?"]),
-        ("[loss]\nrestart_period = 3", ["[loss] has no key", "did you mean fit.restart_period?"]),
-        ("[fit]\nxyzzy = 3", ["[fit] has no key xyzzy", "known: epochs, lr"]),
-        ("fit = 3", ["fit: got 3, expected a table"]),
-        ("[seed]\na = 1", ["seed: got {'a': 1}, expected an integer"]),
-        ('preset = "drift"', ["preset: got 'drift'", "did you mean draft?"]),
-        ('[representation]\nkind = "layer"', ["representation.kind: got 'layer'", "did you mean layers?"]),
-        ("[representation]\ncycles = 0", ["representation.cycles: got 0", "from 1 to 256"]),
-        ('[fit]\nschedule = "cosin"', ["fit.schedule: got 'cosin'", "did you mean cosine?"]),
-        ("[target]\nfile = 'b.exr'\nrotate_degrees = 5", ["a.toml", "target.file and target.rotate_degrees"]),
-        ("[target]\nkind = 'image'", ["target.file", "expected the painted image"]),
-        (
-            "[target]\nkind = 'rendering'\nfile = ['a.png', 'b.png']\nmask = 'm.png'",
-            ["target.mask: got 1 masks, expected 2"],
-        ),
-        ("[target]\nrest = 'stay'", ["target.rest: got 'stay'", "follow"]),
-        ("[solve]\nfreedom = 1.5", ["solve.freedom: got 1.5"]),
-        ("[solve]\nfreedom = -0.1", ["solve.freedom: got -0.1"]),
-        (
-            "[target]\nkind = 'strokes'\nmask = 'm.png'\n[[target.strokes]]\ntype = 'contrast'",
-            ["target.mask: got '", "m.png', expected none"],
-        ),
-        ("[target]\nkind = 'imgae'", ["target.kind: got 'imgae'", "did you mean image?"]),
-        ("[input]\nwidth = 128\nrows = [0, 64]", ["input.rows: got [0, 64], expected rows below 64"]),
-        ("[loss]\nssim = 0\nimage_l1 = 0\nimage_l2 = 0", ["loss.ssim, loss.image_l1, loss.image_l2: got 0"]),
-        ("[fit]\nlog_mse = 0\nlog_ssim = 0\nhdr = 0", ["got 0 for all"]),
-        ("a = ", ["not TOML", "at line 1, column 5", "end of document"]),
-        ("[fit]\nepochs = = 3", ["a.toml: not TOML", "at line 2, column 10"]),
-        ("x = " + "[" * 5000, ["not TOML", "nested too deeply"]),
-        ("seed = " + "9" * 5000, ["not TOML"]),
-        ("seed = 0x" + "f" * 5000, ["seed: got a huge int"]),
-    ],
-)
+@pytest.mark.parametrize("text, parts", [
+    ("[fit]\nepoch = 3", ["a.toml", "[fit] has no key epoch", "did you mean epochs?"]),
+    ("epochs = 3", ["unknown table or key epochs", "did you mean fit.epochs?"]),
+    ("[ouput]\ndir = 'x'", ["unknown table or key ouput", "did you mean output?"]),
+    ("[loss]\nrestart_period = 3", ["[loss] has no key", "did you mean fit.restart_period?"]),
+    ("[fit]\nxyzzy = 3", ["[fit] has no key xyzzy", "known: epochs, lr"]),
+    ("fit = 3", ["fit: got 3, expected a table"]),
+    ("[seed]\na = 1", ["seed: got {'a': 1}, expected an integer"]),
+    ('preset = "drift"', ["preset: got 'drift'", "did you mean draft?"]),
+    ('[representation]\nkind = "layer"', ["representation.kind: got 'layer'", "did you mean layers?"]),
+    ("[representation]\ncycles = 0", ["representation.cycles: got 0", "from 1 to 256"]),
+    ('[fit]\nschedule = "cosin"', ["fit.schedule: got 'cosin'", "did you mean cosine?"]),
+    ("[target]\nfile = 'b.exr'\nrotate_degrees = 5", ["a.toml", "target.file and target.rotate_degrees"]),
+    ("[target]\nkind = 'image'", ["target.file", "expected the painted image"]),
+    (
+        "[target]\nkind = 'rendering'\nfile = ['a.png', 'b.png']\nmask = 'm.png'",
+        ["target.mask: got 1 masks, expected 2"],
+    ),
+    ("[target]\nrest = 'stay'", ["target.rest: got 'stay'", "follow"]),
+    ("[solve]\nfreedom = 1.5", ["solve.freedom: got 1.5"]),
+    ("[solve]\nfreedom = -0.1", ["solve.freedom: got -0.1"]),
+    (
+        "[target]\nkind = 'strokes'\nmask = 'm.png'\n[[target.strokes]]\ntype = 'contrast'",
+        ["target.mask: got '", "m.png', expected none"],
+    ),
+    ("[target]\nkind = 'imgae'", ["target.kind: got 'imgae'", "did you mean image?"]),
+    ("[input]\nwidth = 128\nrows = [0, 64]", ["input.rows: got [0, 64], expected rows below 64"]),
+    ("[loss]\nssim = 0\nimage_l1 = 0\nimage_l2 = 0", ["loss.ssim, loss.image_l1, loss.image_l2: got 0"]),
+    ("[fit]\nlog_mse = 0\nlog_ssim = 0\nhdr = 0", ["got 0 for all"]),
+    ("a = ", ["not TOML", "at line 1, column 5", "end of document"]),
+    ("[fit]\nepochs = = 3", ["a.toml: not TOML", "at line 2, column 10"]),
+    ("x = " + "[" * 5000, ["not TOML", "nested too deeply"]),
+    ("seed = " + "9" * 5000, ["not TOML"]),
+    ("seed = 0x" + "f" * 5000, ["seed: got a huge int"]),
+])  # fmt: skip
 def test_a_refusal_says_where_what_and_what_to_do(text, parts):
     message = refused(text)
     for part in parts:
@@ -143,23 +113,18 @@ def test_keys_of_many_parts_are_refused_before_they_are_parsed():
     assert "did you mean" in refused("", f"input.envmp={{ {parts}a = 1 }}")  # not parsed: a string
     points = "[0.1, 0.25], " * 2000 + "[1.0, 1.0]"
     stroke = f"{{ type = 'light', points = [{points}], width = 0.1 }}"
-    assert (
-        len(cfg.loads(f"[target]\nkind = 'strokes'\nstrokes = [{stroke}]").target.strokes[0]["points"])
-        == 2001
-    )
+    found = cfg.loads(f"[target]\nkind = 'strokes'\nstrokes = [{stroke}]").target.strokes
+    assert len(found[0]["points"]) == 2001
     assert cfg.loads(f"# {'a word. ' * 300}\n[input]\nenvmap = 'a.b.c/../..' # {'.' * 500}").input.envmap
 
 
-def test_a_refusal_is_short_whatever_the_file_holds():
+def test_a_refusal_is_short_and_names_the_override_it_came_from():
     long = "a" * 5000
     assert "known: preset" in refused(f"{long} = 1")
     assert "[fit] has no key 'aaa" in refused(f"[fit]\n{long} = 1")
     twice = refused(f"[{long}]\n[{long}]")
     assert "Cannot declare" in twice and twice.endswith("(at line 2, column 5002)")
     assert "seed" in refused(f"seed = '{long}'")
-
-
-def test_an_error_names_the_override_it_came_from():
     assert refused("", "fit.epochs=-3").startswith("--set 'fit.epochs=-3': fit.epochs: got -3, expected")
     assert "did you mean epochs?" in refused("", "fit.epoch=3")
     assert "expected a table" in refused("", "fit=3")
@@ -249,16 +214,11 @@ def test_nested_values_are_written_and_come_back(table):
 
 known = [f.name for f in dataclasses.fields(cfg.Config)]
 keys = st.sampled_from(known + [k for t in schema.FIELDS.values() for k in t]) | st.text(max_size=5)
+scalars = [st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=5), st.dates()]
+scalars += [st.binary(max_size=3), st.complex_numbers()]
+odd = st.sampled_from(["auto", "sunsky", "layers", "image", "strokes", "\ud800", "a\0b", 10**4000, math.inf])
 anything = st.recursive(
-    st.none()
-    | st.booleans()
-    | st.integers()
-    | st.floats()
-    | st.text(max_size=5)
-    | st.binary(max_size=3)
-    | st.dates()
-    | st.complex_numbers()
-    | st.sampled_from(["auto", "sunsky", "layers", "image", "strokes", "\ud800", "a\0b", 10**4000, math.inf]),
+    st.one_of(*scalars, odd),
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(keys | st.integers(), inner, max_size=4),
     max_leaves=8,
 )
@@ -295,9 +255,6 @@ def test_junk_overrides_raise_nothing_but_config_errors(overrides):
     only_config_errors(lambda: cfg.loads("", overrides=overrides))
 
 
-@pytest.mark.parametrize(
-    "text", ['vgg = "a.npz"', 'dists = "a.npz"', 'backbone = "a.npz"', 'heads = "a.npz"']
-)
-def test_perceptual_weights_come_in_pairs(text):
-    with pytest.raises(ConfigError, match="expected both or none"):
-        cfg.loads(f"[perceptual]\n{text}")
+@pytest.mark.parametrize("key", ["vgg", "dists", "backbone", "heads"])
+def test_perceptual_weights_come_in_pairs(key):
+    assert "expected both or none" in refused(f"[perceptual]\n{key} = 'a.npz'")

@@ -1,4 +1,4 @@
-"""The table of seeds: the values that results were made with, no two alike, and no seed made elsewhere."""
+"""The table of seeds: no two purposes share one, and no seed is made elsewhere."""
 
 import re
 from dataclasses import asdict
@@ -7,26 +7,11 @@ from envedit.core import seeds
 from tests.oracles import ROOT
 
 
-def test_seeds_are_those_that_results_were_made_with():
-    """Another number here makes other bytes of every result."""
-    expected = {
-        "fit": 5, "transport": 5, "second_recording": 500_014, "step_check": 700_006,
-        "turn_check": 800_016, "solution_check": 900_006, "target": 7_000_008, "target_again": 7_500_018,
-        "exported": 8_000_014, "painted_initial": 9_000_016, "judged": 9_000_017, "page": 9_000_026,
-    }  # fmt: skip
-    assert asdict(seeds.Seeds.of(5)) == expected
-    assert (seeds.recording(5, 0), seeds.recording(5, 2)) == (5, 2_000_011)
-    assert (seeds.pilot(5), seeds.columns(5), seeds.SIGNS) == (104_734, 7_924, 0)
-
-
-def test_no_two_purposes_share_samples():
+def test_no_two_purposes_share_samples_and_the_largest_seed_stays_one():
     found = asdict(seeds.Seeds.of(0))
     del found["fit"]  # a network's weights are no samples of a rendering
     own = [*found.values(), seeds.pilot(0), seeds.columns(0), *(seeds.recording(0, i) for i in range(1, 10))]
     assert len(set(own)) == len(own)
-
-
-def test_the_largest_seed_stays_one_where_it_goes_to_mitsuba_or_a_configuration():
     most = seeds.Seeds.of(2**32 - 1)
     checks = most.step_check, most.turn_check, most.solution_check
     assert (most.second_recording, *checks) == (500_008, 700_000, 800_010, 900_000)

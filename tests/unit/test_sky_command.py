@@ -67,21 +67,18 @@ def test_a_sun_by_its_angles_and_a_name_that_is_free(capsys, here):
 PLACE = ["--place", "47", "8"]
 
 
-@pytest.mark.parametrize(
-    ("options", "says"),
-    [
-        ([], "which sun? give --elevation"),
-        (["--azimuth", "3"], "which sun? give --elevation"),
-        (["--elevation", "3", *PLACE], "which sun?"),
-        (PLACE, "--place and --date are needed together"),
-        ([*PLACE, "--date", "2026-06-21T12:00"], "without an offset from UTC"),
-        ([*PLACE, "--date", "noon"], "expected a time in ISO 8601"),
-        ([*PLACE, "--date", "1066-10-14T12:00Z"], "got year 1066, expected 1800 to 2200"),
-        ([*PLACE, "--date", "2026-06-21T23:30Z"], "below the horizon there and then"),
-        (["--place", "91", "8", "--date", "2026-06-21T12:00Z"], "--place: got 91 8"),
-        (["--elevation", "30", "--width", "7"], "width: got 7, expected an even integer"),
-    ],
-)
+@pytest.mark.parametrize(("options", "says"), [
+    ([], "which sun? give --elevation"),
+    (["--azimuth", "3"], "which sun? give --elevation"),
+    (["--elevation", "3", *PLACE], "which sun?"),
+    (PLACE, "--place and --date are needed together"),
+    ([*PLACE, "--date", "2026-06-21T12:00"], "without an offset from UTC"),
+    ([*PLACE, "--date", "noon"], "expected a time in ISO 8601"),
+    ([*PLACE, "--date", "1066-10-14T12:00Z"], "got year 1066, expected 1800 to 2200"),
+    ([*PLACE, "--date", "2026-06-21T23:30Z"], "below the horizon there and then"),
+    (["--place", "91", "8", "--date", "2026-06-21T12:00Z"], "--place: got 91 8"),
+    (["--elevation", "30", "--width", "7"], "width: got 7, expected an even integer"),
+])  # fmt: skip
 def test_bad_options_are_one_line(options, says, tmp_path, capsys, here):
     assert sky.main(options) == 2
     err = capsys.readouterr().err

@@ -55,14 +55,11 @@ def test_noise_alone_changes_nothing(noise, transport, envmap, rng):
     np.testing.assert_array_equal(sky_factor.find(transport, envmap, ALL, picture), 1)
 
 
-def test_texels_that_stay_are_no_part_of_it(transport, envmap):
+def test_texels_that_stay_and_pixels_that_do_not_count_have_no_say(transport, envmap):
     active = ALL.copy()
     active[:, : WIDTH // 2] = False
     picture = transport.exact(np.where(active[..., None], 4 * envmap, envmap))
     np.testing.assert_allclose(sky_factor.find(transport, envmap, active, picture), 4, rtol=0.045)
-
-
-def test_pixels_that_do_not_count_say_nothing(transport, envmap):
     picture = transport.exact(2 * envmap)
     picture[: PIXELS // 2] = 0.9
     weight = np.ones((PIXELS, PIXELS, 1), np.float32)

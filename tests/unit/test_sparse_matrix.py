@@ -74,9 +74,8 @@ def test_transposed_is_the_dense_transpose_of_some_rows(rng, shape, vectors):
         values = rng.standard_normal((vectors, len(some), 3)).astype(np.float32)
         got = matrix.transposed(some, values)
         expected = np.einsum("ijc,kic->kjc", full[some], values.astype(np.float64))
-        magnitude = np.einsum(
-            "ijc,kic->kjc", np.abs(dense(*entry[:2], np.abs(entry[2]), shape))[some], np.abs(values)
-        )
+        sizes = dense(*entry[:2], np.abs(entry[2]), shape)[some]
+        magnitude = np.einsum("ijc,kic->kjc", sizes, np.abs(values))
         assert got.shape == (vectors, shape[1], 3) and got.dtype == np.float32
         # Products and the result are rounded, sums are in float64; entries may share a place.
         assert (np.abs(got - expected) <= 4 * 2.0**-24 * magnitude).all()
@@ -118,17 +117,6 @@ def test_column_indices_survive_as_bits_of_a_float():
     np.testing.assert_array_equal(np.array(matrix.apply(x)).ravel(), [1, 2, 3])
 
 
-def test_product_has_the_same_bits_every_time(rng):
-    rows, columns, weights = entries(rng, (300, 40), 5000)
-    x = rng.standard_normal((40, 3)).astype(np.float32)
-    first = product(ColourMatrix(rows, columns, weights, (300, 40)), x)
-    for _ in range(3):
-        np.testing.assert_array_equal(product(ColourMatrix(rows, columns, weights, (300, 40)), x), first)
-
-
-# ---- coordinates -------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     "shape, count", [((37, 101), 200), ((9, 4), 0), ((1, 5), 3), ((64, 1), 20), ((300, 7), 900), ((16, 9), 1)]
 )
@@ -154,9 +142,6 @@ def test_coordinates_leave_out_what_is_zero(rng):
     np.testing.assert_array_equal(dense(r, c, w, (20, 30)), dense(rows, columns, weights, (20, 30)))
 
 
-# ---- merge -------------------------------------------------------------------------------------------------
-
-
 def test_merge_adds_entries_of_one_place_and_sorts_them(rng):
     rows, columns, weights = entries(rng, (6, 5), 400)
     r, c, w = merge(rows, columns, weights, 5)
@@ -166,21 +151,12 @@ def test_merge_adds_entries_of_one_place_and_sorts_them(rng):
     expected = dense(rows, columns, weights, (6, 5))[r, c]
     np.testing.assert_allclose(w, expected, rtol=2.0**-23, atol=1e-12)
     assert (r.dtype, c.dtype, w.dtype) == (np.uint32, np.uint32, np.float32)
-
-
-def test_merge_keeps_a_small_light_beside_a_large_one():
     # 1e8 + 1 in float32 is 1e8: sums are accumulated in float64.
     zero = np.zeros(4, np.uint32)
     weights = np.array([[1e8], [1.0], [-1e8], [1.0]], np.float32).repeat(3, axis=1)
     np.testing.assert_array_equal(merge(zero, zero, weights, 1)[2], [[2, 2, 2]])
-
-
-def test_merge_of_nothing_is_nothing():
     r, c, w = merge(np.zeros(0, np.uint32), np.zeros(0, np.uint32), np.zeros((0, 3), np.float32), 7)
     assert r.shape == c.shape == (0,) and w.shape == (0, 3)
-
-
-def test_merge_knows_places_beyond_32_bits():
     rows, columns = np.array([200_000, 200_000, 0], np.uint32), np.array([99_999, 99_999, 1], np.uint32)
     r, c, w = merge(rows, columns, np.ones((3, 3), np.float32), 100_000)
     np.testing.assert_array_equal(np.stack([r, c]), [[0, 200_000], [1, 99_999]])

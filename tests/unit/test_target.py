@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import mitsuba as mi
 import numpy as np
 import pytest
 
@@ -14,7 +13,7 @@ from envedit.core.seeds import Seeds
 from envedit.images import images
 from envedit.scene import scene
 from envedit.targets import initial_rendering, pixel_weights, target
-from tests.oracles.builders import BALL, LIGHT, SENSOR, exr, sky, write_scene
+from tests.oracles.builders import BALL, LIGHT, SENSOR, floats, png, sky, write_scene
 from tests.oracles.users_scenes import HIDDEN
 
 SIZE = (12, 16)
@@ -29,19 +28,7 @@ def asking(seed=0, repair=False, **kwargs):
     return config.Config(seed=seed, input=config.Input(repair=repair), target=config.Target(spp=4, **kwargs))
 
 
-def paint(path, picture):
-    """Write a picture (H, W, 3), also one that is not finite, as EXR."""
-    return exr(path, **{c: np.ascontiguousarray(picture[..., i], np.float32) for i, c in enumerate("RGB")})
-
-
-def png(path, values):
-    mi.Bitmap(np.ascontiguousarray(values)).write(str(path))
-    return path
-
-
 # ---- rendered under a known map --------------------------------------------------------------------------
-
-
 def test_turned_target_is_the_rendering_of_the_turned_map(ball, rng):
     envmap = sky(rng)
     made = target.make(asking(5, rotate_degrees=40), ball, envmap)
@@ -65,7 +52,7 @@ def test_noise_is_that_of_as_many_samples_as_were_taken(ball, rng):
 def test_another_map_is_read_at_the_working_width(ball, tmp_path, rng):
     other = sky(rng, 16, 32)
     other[0, 0, 0] = -1
-    file = paint(tmp_path / "other.exr", other)
+    file = floats(tmp_path / "other.exr", other)
     made = target.make(asking(1, file=str(file)), ball, sky(rng))
     expected, info = images.load_envmap(file, 16)
     np.testing.assert_array_equal(made.envmap, expected)
@@ -77,16 +64,11 @@ def test_another_map_is_read_at_the_working_width(ball, tmp_path, rng):
 def test_a_map_that_is_not_finite_is_refused_or_repaired(ball, tmp_path, rng):
     other = sky(rng)
     other[3, 4] = np.nan
-    file = str(paint(tmp_path / "other.exr", other))
+    file = str(floats(tmp_path / "other.exr", other))
     with pytest.raises(InputError, match=r"other\.exr.*row 3, column 4"):
         target.make(asking(file=file), ball, sky(rng))
     made = target.make(asking(file=file, repair=True), ball, sky(rng))
     assert np.isfinite(made.picture).all() and np.isfinite(made.envmap).all()
-
-
-def test_a_missing_map_is_refused(ball, tmp_path, rng):
-    with pytest.raises(InputError, match=r"nowhere\.exr"):
-        target.make(asking(file=str(tmp_path / "nowhere.exr")), ball, sky(rng))
 
 
 def test_a_target_that_is_largely_white_is_warned_of(ball, rng):
@@ -109,8 +91,6 @@ def test_mask_counts_for_a_rendered_target_too(ball, tmp_path, rng):
 
 
 # ---- painted ---------------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def seen(ball):
     envmap = sky(np.random.default_rng(3))
@@ -121,16 +101,13 @@ def a_stroke(**kwargs):
     return {"type": "shadow", "rectangle": [0.25, 0.25, 0.75, 0.75], "amount": 0.5, **kwargs}
 
 
-def test_strokes_lie_on_the_initial_rendering(ball, seen):
+def test_strokes_lie_on_the_initial_rendering_and_beside_it_are_refused(ball, seen):
     envmap, initial = seen
     made = target.make(asking(kind="strokes", strokes=(a_stroke(),)), ball, envmap)
     np.testing.assert_array_equal(made.initial, initial)
     np.testing.assert_allclose(made.picture[3:9, 4:12], 0.5 * initial[3:9, 4:12], rtol=1e-6)
     np.testing.assert_array_equal(made.picture[:3], initial[:3])
     assert made.envmap is None and made.asked == () and "1 strokes" in made.source
-
-
-def test_strokes_beside_the_picture_are_refused(ball, seen):
     with pytest.raises(InputError, match=r"target\.strokes"):
         beside = a_stroke(rectangle=[3, 3, 4, 4])
         target.make(asking(kind="strokes", strokes=(beside,)), ball, seen[0])
@@ -140,7 +117,7 @@ def test_an_array_asks_what_its_file_would(ball, seen, tmp_path):
     envmap, initial = seen
     picture = initial.copy()
     picture[2:5, 3:9] *= 2
-    file = paint(tmp_path / "painted.exr", picture)
+    file = floats(tmp_path / "painted.exr", picture)
     from_file = target.make(asking(kind="image", file=str(file), rotate_degrees=0), ball, envmap)
     from_array = target.make(asking(), ball, envmap, picture)
     np.testing.assert_array_equal(from_array.picture, from_file.picture)
@@ -178,24 +155,19 @@ def test_mask_of_an_array_overrides_what_is_seen(ball, seen):
     np.testing.assert_allclose(made.picture[:2], 2 * initial[:2], rtol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("picture", "mask", "says"),
-    [
-        (np.ones((3, 4, 3)), None, "shape"),
-        (np.full((*SIZE, 3), np.nan), None, "not finite"),
-        (np.ones((*SIZE, 3)), np.ones((4, 4)), "mask"),
-        (np.ones((*SIZE, 3)), np.full(SIZE, np.inf), "mask.*not finite"),
-        (np.ones((*SIZE, 3)), np.zeros(SIZE), "nothing"),
-    ],
-)
+@pytest.mark.parametrize(("picture", "mask", "says"), [
+    (np.ones((3, 4, 3)), None, "shape"),
+    (np.full((*SIZE, 3), np.nan), None, "not finite"),
+    (np.ones((*SIZE, 3)), np.ones((4, 4)), "mask"),
+    (np.ones((*SIZE, 3)), np.full(SIZE, np.inf), "mask.*not finite"),
+    (np.ones((*SIZE, 3)), np.zeros(SIZE), "nothing"),
+])  # fmt: skip
 def test_arrays_that_cannot_be_used(ball, seen, picture, mask, says):
     with pytest.raises(InputError, match=says):
         target.make(asking(), ball, seen[0], picture, mask)
 
 
 # ---- a picture of the scene under other light -----------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def pictured(ball):
     """A map, and the scene's picture under another one, within what a display shows."""
@@ -205,7 +177,6 @@ def pictured(ball):
 
 
 def shown_as_srgb(picture):
-    """Return 8-bit sRGB values by the standard's formula."""
     low = picture <= 0.0031308
     return np.round(255 * np.where(low, 12.92 * picture, 1.055 * picture ** (1 / 2.4) - 0.055)).astype("u1")
 
@@ -221,13 +192,12 @@ def of_a_picture(ball, pictured, **kwargs):
 def test_a_picture_of_the_scene_is_read_as_linear_radiance(ball, pictured, tmp_path):
     """From OpenEXR as it is, from a PNG that says nothing as sRGB, from an array likewise linear."""
     envmap, picture = pictured
-    made = of_a_picture(ball, pictured, file=str(paint(tmp_path / "a.exr", picture)))
+    made = of_a_picture(ball, pictured, file=str(floats(tmp_path / "a.exr", picture)))
     np.testing.assert_array_equal(made.picture, picture)
     assert made.weight is None and made.warnings == () and len(made.asked) == 1
     srgb = of_a_picture(ball, pictured, file=str(png(tmp_path / "a.png", shown_as_srgb(picture))))
     step = np.maximum(picture, 0.1) ** (1 - 1 / 2.4) / 255  # a step of 8 bits, and more
-    assert (np.abs(srgb.picture - picture) < 1.5 * step).all()
-    assert srgb.weight is None
+    assert (np.abs(srgb.picture - picture) < 1.5 * step).all() and srgb.weight is None
     named = of_a_picture(ball, pictured, file=str(tmp_path / "a.png"), tonemap="gamma")
     np.testing.assert_allclose(named.picture, (shown_as_srgb(picture) / 255) ** 2.2, rtol=1e-4)
     array = target.make(asking(kind="rendering", file=images.ARRAY), ball, envmap, picture)
@@ -236,7 +206,8 @@ def test_a_picture_of_the_scene_is_read_as_linear_radiance(ball, pictured, tmp_p
 
 
 def test_pixels_of_a_picture_that_are_clipped_or_masked_do_not_count(ball, pictured, tmp_path):
-    values, mask = shown_as_srgb(pictured[1]), np.zeros((*SIZE, 3), np.uint8)
+    envmap, picture = pictured
+    values, mask = shown_as_srgb(picture), np.zeros((*SIZE, 3), np.uint8)
     values[2, 3:5], mask[1:7] = 255, 255
     file, masked = (str(png(tmp_path / name, v)) for name, v in (("a.png", values), ("m.png", mask)))
     clipped = of_a_picture(ball, pictured, file=file)
@@ -247,9 +218,8 @@ def test_pixels_of_a_picture_that_are_clipped_or_masked_do_not_count(ball, pictu
     both = of_a_picture(ball, pictured, file=file, mask=masked)
     assert both.known_weight.sum() == 6 * SIZE[1] - 2 and not both.known_weight[7:].any()
     assert both.weight[1:7].all() and not both.weight[7:].any()
-    array = target.make(
-        asking(kind="rendering", file=images.ARRAY), ball, pictured[0], pictured[1], mask[..., 0] / 255
-    )
+    asked = asking(kind="rendering", file=images.ARRAY)
+    array = target.make(asked, ball, envmap, picture, mask[..., 0] / 255)
     assert array.weight.sum() == 6 * SIZE[1] and len(array.asked) == 2
     mask[1:7], mask[2, 3:5] = 0, 255
     png(tmp_path / "m.png", mask)
@@ -259,12 +229,12 @@ def test_pixels_of_a_picture_that_are_clipped_or_masked_do_not_count(ball, pictu
 
 def test_a_file_of_a_target_map_that_is_no_panorama_is_a_picture(ball, pictured, tmp_path):
     """A map is 2:1; the source says what the file was taken for."""
-    file = str(paint(tmp_path / "a.exr", pictured[1]))
+    file = str(floats(tmp_path / "a.exr", pictured[1]))
     made = target.make(asking(file=file), ball, pictured[0])
     assert made.envmap is None and "not 2:1" in made.source
     np.testing.assert_array_equal(made.picture, of_a_picture(ball, pictured, file=file).picture)
     with pytest.raises(InputError, match=r"b\.exr"):  # 4:3 as the film, of another aspect than it
-        target.make(asking(file=str(paint(tmp_path / "b.exr", pictured[1][:, :10]))), ball, pictured[0])
+        target.make(asking(file=str(floats(tmp_path / "b.exr", pictured[1][:, :10]))), ball, pictured[0])
 
 
 @pytest.mark.slow
@@ -274,13 +244,13 @@ def test_a_painted_image_that_was_rendered_anew_is_solved_as_a_rendering(tmp_pat
     envmap = 0.2 * (sky(rng, 16, 32) + 0.05)
     asked = {"kind": "image", "file": str(tmp_path / "a.exr")}
     initial = initial_rendering.initial(lit, envmap, asking())
-    paint(tmp_path / "a.exr", lit.render(np.roll(envmap, 9, axis=1), spp=16, seed=5))
+    floats(tmp_path / "a.exr", lit.render(np.roll(envmap, 9, axis=1), spp=16, seed=5))
     anew = target.make(asking(**asked), lit, envmap)
     assert anew.coverage is None and anew.noise is not None and "solved as a rendering" in anew.source
     white = np.full((48, 48, 3), 255, np.uint8)
     masked = target.make(asking(**asked, mask=str(png(tmp_path / "m.png", white))), lit, envmap)
     assert masked.coverage.all() and masked.noise is None
-    paint(tmp_path / "a.exr", 0.7 * initial)
+    floats(tmp_path / "a.exr", 0.7 * initial)
     painted = target.make(asking(**asked), lit, envmap)
     assert painted.coverage.mean() > 0.9 and painted.noise is None and "painted" in painted.source
 
@@ -289,35 +259,28 @@ def test_every_view_of_a_picture_of_the_scene_may_have_its_file(ball, pictured, 
     """Views without one do not count."""
     views = (scene.View("left", slice(0, 6)), scene.View("right", slice(6, 12)))
     lit = replace(ball, views=views)
-    file = str(paint(tmp_path / "right.exr", pictured[1][6:]))
+    file = str(floats(tmp_path / "right.exr", pictured[1][6:]))
     made = target.make(asking(kind="rendering", file=(file,), view=("right",)), lit, pictured[0])
     np.testing.assert_array_equal(made.picture[6:], pictured[1][6:])
     assert (made.weight[6:] == 1).all() and not made.weight[:6].any()
 
 
 # ---- weights ---------------------------------------------------------------------------------------------
-
-
 def test_paint_and_rest_have_their_weights_whatever_their_size():
     coverage = np.zeros((10, 10, 1))
     coverage[0, :2] = 1
     coverage[0, 2] = 0.5
     weight = pixel_weights.pixel_weight(coverage, np.zeros((10, 10), bool), paint=3, hold=1)
     assert weight.mean() == pytest.approx(1, rel=1e-6)
-    painted_part = 3 * coverage / coverage.sum()
-    np.testing.assert_allclose(
-        weight / weight.sum(), (painted_part + (1 - coverage) / (1 - coverage).sum()) / 4, rtol=1e-5
-    )
+    shares = 3 * coverage / coverage.sum() + (1 - coverage) / (1 - coverage).sum()
+    np.testing.assert_allclose(weight / weight.sum(), shares / 4, rtol=1e-5)
 
 
-def test_what_tells_nothing_has_no_weight():
+def test_what_tells_nothing_has_no_weight_and_a_target_without_any_is_refused():
     excluded = np.zeros((4, 5), bool)
     excluded[1] = True
     weight = pixel_weights.pixel_weight(np.ones((4, 5, 1)), excluded, paint=1, hold=1)
     assert not weight[1].any() and (weight[[0, 2, 3]] == weight[0, 0]).all()
-
-
-def test_a_target_without_weight_is_refused():
     with pytest.raises(InputError, match="no pixel counts"):
         pixel_weights.pixel_weight(np.ones((4, 5, 1)), np.zeros((4, 5), bool), paint=0, hold=1)
     with pytest.raises(ConfigError, match=r"target\.paint"):
@@ -325,8 +288,6 @@ def test_a_target_without_weight_is_refused():
 
 
 # ---- pixels that see no surface ---------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 def test_paint_beside_the_object_does_not_count(tmp_path, rng):
     """Of a scene that hides what lights it: weights are shared out among pixels that see a surface."""

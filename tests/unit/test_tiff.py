@@ -29,15 +29,11 @@ def test_codes_are_those_of_a_png(tmp_path, keys):
         assert (info["hdr"], info["bits"]) == (False, 16)
 
 
-def test_alpha_stays_and_orientation_is_undone(tmp_path):
+def test_alpha_stays_orientation_is_undone_and_floats_are_linear(tmp_path):
     tags = [(274, "H", 1, 3, True)]
-    tifffile.imwrite(
-        tmp_path / "a.tif", CODES, photometric="rgb", extrasamples=["unassalpha"], extratags=tags
-    )
+    keys = {"photometric": "rgb", "extrasamples": ["unassalpha"], "extratags": tags}
+    tifffile.imwrite(tmp_path / "a.tif", CODES, **keys)
     np.testing.assert_array_equal(images.read_stored(tmp_path / "a.tif")[0], CODES[::-1, ::-1])
-
-
-def test_floats_are_linear_and_grey_becomes_rgb(tmp_path):
     light = np.float32(CODES[..., 0]) / 1000
     tifffile.imwrite(tmp_path / "a.tif", light, photometric="minisblack")
     found, info = images.read(tmp_path / "a.tif")

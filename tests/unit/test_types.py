@@ -44,10 +44,6 @@ def test_no_public_parameter_or_return_is_unannotated():
     assert found == []
 
 
-def test_the_package_says_that_it_is_typed():
-    assert (ROOT / "envedit" / "py.typed").is_file()  # test_wheel.py looks for it in the wheel
-
-
 @pytest.mark.skipif(importlib.util.find_spec("mypy") is None, reason="mypy is not installed: envedit[dev]")
 def test_mypy_finds_nothing(tmp_path):
     mypy = [sys.executable, "-m", "mypy", "--cache-dir", str(tmp_path)]

@@ -15,19 +15,16 @@ HEIGHT, WIDTH = 32, 64
 
 
 def stage_of(folder, to_world, scale=1.0):
-    """Write the stage of a map with two lights; returns it and the list of lights."""
     envmap = np.full((HEIGHT, WIDTH, 3), 0.2, np.float32)
     envmap[7, 50] = [900, 600, 300]
     envmap[12, 9] = [30, 90, 200]
     lights = light_list.listed(separate(envmap).lights, (HEIGHT, WIDTH), to_world)
-    (folder / "edited.usda").write_text(
-        usd_scene.text("edited.exr", "edited_sky.exr", lights, to_world, scale)
-    )
+    text = usd_scene.text("edited.exr", "edited_sky.exr", lights, to_world, scale)
+    (folder / "edited.usda").write_text(text)
     return Usd.Stage.Open(str(folder / "edited.usda")), lights
 
 
 def in_world(prim, vector):
-    """Transform a direction by a prim."""
     return np.array(UsdGeom.XformCache().GetLocalToWorldTransform(prim).TransformDir(tuple(vector)))
 
 

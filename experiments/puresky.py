@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import difflib
 import os
 import re
 from pathlib import Path
 
+from envedit.config.validators import meant
 from envedit.core.errors import ConfigError, InputError
 
 _NAME = re.compile(r"(?P<name>.+)_puresky_(?P<size>[1-9][0-9]?)k\.(?P<kind>hdr|exr)")
@@ -52,7 +52,6 @@ def file(name: str) -> str:
     """Return the file of a map of ENVEDIT_DATA; ConfigError if there is none of this name."""
     found = find()
     if name not in found:
-        close = difflib.get_close_matches(name, found, 1)
-        hint = f"did you mean {close[0]}?" if close else f"there are {', '.join(found)}"
+        hint = meant(name, found, f"there are {', '.join(found)}")
         raise ConfigError(f"no map {name}; {hint}")
     return str(found[name])

@@ -49,7 +49,6 @@ def _apply(arguments, console):
     files = [_files(folder, source, len(amounts)) for source in maps]
     _check(files)
     selected = [looks.read(name) for name in names]
-    make_folder(folder)
     start = selected[0] if len(selected) == 2 else None
 
     # ---- Map by map, each read once
@@ -57,6 +56,7 @@ def _apply(arguments, console):
     console.facts["files"] = []
     for source, targets in zip(maps, files, strict=True):
         input_map = map_command.read(source, arguments, console)
+        make_folder(folder)
         for amount, path in zip(amounts, targets, strict=True):
             edited = look_transfer.apply(input_map.radiance, selected[-1], amount, start)
             map_command.write(path, input_map.as_stored(edited), input_map, console)

@@ -27,13 +27,22 @@ def make_parser(
     )
 
 
+def add_overrides(parser: argparse.ArgumentParser, example: str) -> None:
+    """Add ``--set``, the option ``overrides``: keys of the configuration with other values."""
+    parser.add_argument(
+        "--set",
+        metavar="table.key=value",
+        action="append",
+        default=[],
+        dest="overrides",
+        help=f"change one key of the configuration, such as {example}; may be repeated",
+    )
+
+
 class Console:
     """What a run writes: lines to stdout, progress, warnings and errors to stderr, the object of ``--json``.
 
-    Attributes
-    ----------
-    facts : dict
-        What the object of ``--json`` will have beside the exit code.
+    ``facts`` is what the object of ``--json`` will have beside the exit code.
     """
 
     def __init__(

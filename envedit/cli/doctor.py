@@ -17,7 +17,6 @@ from __future__ import annotations
 import contextlib
 import glob
 import hashlib
-import importlib.metadata
 import json
 import os
 import platform
@@ -33,9 +32,9 @@ from typing import Any
 
 from envedit.cli.console import make_parser
 from envedit.cli.streams import steady
+from envedit.core import machine
 from envedit.core.atomic_files import opened, write_atomically
 from envedit.core.errors import InputError, MachineError
-from envedit.core.processor import cores
 
 ALBEDO = 0.5
 _VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb", "metal_ad_rgb")
@@ -76,7 +75,7 @@ def check(variant: str = "llvm_ad_rgb") -> Diagnosis:
         cause = f"envedit does not run on variant {variant!r}"
         return Diagnosis(False, (cause, f"use {' or '.join(_VARIANTS)}"))
     for package in ("mitsuba", "drjit"):
-        if _version(package) is None:
+        if machine.version(package) is None:
             return Diagnosis(False, (f"the package {package} is missing", f"run: pip install {package}"))
 
     # ---- The child, which finds this package even in a source checkout that is not installed
@@ -208,19 +207,13 @@ def _last(lines: list[str]) -> str:
     return lines[-1][:200] if lines else "it said nothing"
 
 
-def _version(package: str) -> str | None:
-    try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-        return None
-
-
 def _memory(variant: str) -> Path | None:
     """Return the file that remembers a success for this variant, these packages and these libraries."""
     from envedit.core.array_cache import cache_home  # with numpy
 
     libraries = sorted(name for pattern in _LIBRARIES for name in glob.glob(pattern))
-    parts = [variant, sys.version, sys.executable, _version("mitsuba"), _version("drjit"), libraries]
+    versions = [machine.version("mitsuba"), machine.version("drjit")]
+    parts = [variant, sys.version, sys.executable, *versions, libraries]
     parts += [os.environ.get(name) for name in ("DRJIT_LIBLLVM_PATH", "LD_LIBRARY_PATH")]
     key = hashlib.sha256(repr(parts).encode()).hexdigest()[:16]
     home = cache_home()
@@ -248,23 +241,15 @@ def _probe(variant: str) -> None:
         print(json.dumps(facts), flush=True)
 
     # ---- Versions, the variant, and the LLVM library that it has loaded
-    say(mitsuba=_version("mitsuba"), drjit=_version("drjit"))
+    say(mitsuba=machine.version("mitsuba"), drjit=machine.version("drjit"))
     import drjit as dr
     import mitsuba as mi
 
     mi.set_variant(variant)
     dr.eval(mi.Float(1, 2) + 1)
-    library = None
-    with contextlib.suppress(OSError):
-        lines = Path("/proc/self/maps").read_text().splitlines()
-        mapped_files = [line.split(None, 5)[-1].strip() for line in lines]
-        path = os.environ.get("DRJIT_LIBLLVM_PATH") or "libLLVM"
-        names = {os.path.basename(path), os.path.basename(os.path.realpath(path)), "libLLVM"}
-        candidates = (file for file in mapped_files if any(n in os.path.basename(file) for n in names))
-        library = next(candidates, None)
-    facts = {"selected": True, "llvm_path": library}
+    facts = {"selected": True, "llvm_path": machine.llvm_library()}
     if variant.startswith("llvm"):
-        facts["llvm"] = ".".join(map(str, dr.detail.llvm_version()))
+        facts["llvm"] = machine.llvm_version()
     say(**facts)
 
     # ---- A rendering, and the speed of matrix products
@@ -340,8 +325,8 @@ def main(arguments: list[str] | None = None) -> int:
     # ---- What is installed
     print(f"python    {platform.python_version()} ({sys.executable})")
     for package in ("mitsuba", "drjit", "OpenEXR", "numpy"):
-        print(f"{package.lower():9} {_version(package) or 'missing'}")
-    print(f"cores     {cores()}")
+        print(f"{package.lower():9} {machine.version(package) or 'missing'}")
+    print(f"cores     {machine.cores()}")
     print(f"memory    {_memory_size()}")
 
     # ---- What the self test found
@@ -356,7 +341,7 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"matmul    {versions['gflops']} GFLOP/s (256 x 256, float32)")
 
     # ---- Verdict
-    missing = [name for name in ("OpenEXR", "numpy") if _version(name) is None]
+    missing = [name for name in ("OpenEXR", "numpy") if machine.version(name) is None]
     if diagnosis.ok and missing:
         diagnosis = Diagnosis(False, (f"missing packages; run: pip install {' '.join(missing)}",))
     print(f"{options.variant}: {'ready' if diagnosis.ok else 'cannot run envedit'}", flush=True)

@@ -8,10 +8,11 @@ import mitsuba as mi
 
 from envedit import config, inputs
 from envedit.cli import doctor
-from envedit.cli.console import Console, exit_code, make_parser
+from envedit.cli.console import Console, add_overrides, exit_code, make_parser
 from envedit.cli.streams import steady
 from envedit.config import presets
 from envedit.core.array_cache import cache_folder
+from envedit.core.atomic_files import write_atomically
 from envedit.images import images
 from envedit.losses import metrics
 from envedit.report import manifest, output_folder, preview
@@ -37,14 +38,7 @@ def main(argv: list[str] | None = None) -> int:
         "--out", metavar="DIR", help="folder for the results (default: MAP_fit in the working folder)"
     )
     parser.add_argument("--preset", choices=tuple(presets.PRESETS), help="named set of defaults")
-    parser.add_argument(
-        "--set",
-        metavar="table.key=value",
-        action="append",
-        default=[],
-        dest="overrides",
-        help="change one key of the configuration, such as fit.epochs=500; may be repeated",
-    )
+    add_overrides(parser, "fit.epochs=500")
     arguments = parser.parse_args(argv)
     goes_on = "running it again goes on where the fit was last kept"
     interrupted = f"interrupted; no results were written ({goes_on})"
@@ -93,7 +87,7 @@ def _fit(arguments, settings, original, folder, console):
     marks = {"source": arguments.map, "rows": f"{rows.first} to {rows.last}"}
     whole = len(reproduced) == len(original)
     images.write_exr(folder / "fitted.exr", reproduced, marks, panorama=whole)
-    preview.preview(folder / "preview.png", {"map": active, "fit": reproduced}, {})
+    write_atomically(folder / "preview.png", preview.sheet({"map": active, "fit": reproduced}, {}))
 
     # ---- How good it is
     numbers = {

@@ -74,13 +74,14 @@ def main(argv: list[str] | None = None) -> int:
 
 def _write(arguments):
     from envedit import config
+    from envedit.config import presets
     from envedit.core.atomic_files import write_atomically
 
     file = Path(arguments.out)
     if os.path.lexists(file):
         raise ConfigError(f"{file}: exists already; delete it, or give another name with --out")
-    lights = "auto", "scene", "sunsky"
-    envmap = _file_name("--envmap", arguments.envmap, lights, "an EXR or Radiance HDR file", file.parent)
+    kind = "an EXR or Radiance HDR file"
+    envmap = _file_name("--envmap", arguments.envmap, presets.MAP_WORDS, kind, file.parent)
     scene = _file_name("SCENE", arguments.scene, shipped.scenes(), "a Mitsuba XML or USD file", file.parent)
     text = TEMPLATE.format(
         name=file.name,

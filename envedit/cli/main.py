@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import difflib
 import importlib
 import sys
 
@@ -40,8 +39,9 @@ def main(argv: list[str] | None = None) -> int:
         return 2
     command = parser.parse_args(arguments[:1]).command
     if command not in COMMANDS:
-        close = difflib.get_close_matches(command, COMMANDS, 1)
-        hint = f"did you mean {close[0]}?" if close else "see envedit --help"
+        from envedit.config.validators import meant
+
+        hint = meant(command, COMMANDS, "see envedit --help")
         parser.error(f"got command {command!r}, expected one of {', '.join(COMMANDS)}; {hint}")
     try:
         return importlib.import_module(f"envedit.cli.{command}").main(arguments[1:])

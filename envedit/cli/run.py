@@ -234,6 +234,7 @@ def _dry_run(settings, base, console):
     """Write what a run would edit towards, and nothing else: a picture to look at, and linear radiance."""
     doctor.select(settings.variant)
     from envedit import inputs
+    from envedit.core.atomic_files import write_atomically
     from envedit.images import images
     from envedit.report import output_folder, preview
     from envedit.targets.target import make as make_target
@@ -247,13 +248,13 @@ def _dry_run(settings, base, console):
         input_map = inputs.read_map(settings.input, scene, settings.input.width)
         envmap = input_map.radiance
         target = make_target(settings, scene, envmap)
-        preview.preview(
-            picture_file,
+        sheet = preview.sheet(
             {"initial": target.initial, "target": target.picture},
             {"initial": envmap, "target": target.envmap},
             settings.output.tonemap,
-            views=[view.rows for view in scene.views],
+            [view.rows for view in scene.views],
         )
+        write_atomically(picture_file, sheet)
         images.write_exr(radiance_file, target.picture, {"content": "target"}, panorama=False)
     for line in (*input_map.warnings, *target.warnings):
         console.warn(line)

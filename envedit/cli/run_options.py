@@ -80,14 +80,7 @@ def make_parser() -> argparse.ArgumentParser:
         help="named set of defaults: standard; draft, smaller, in two fifths of the time; paper, settings "
         "of D'Orazio et al. 2024",
     )
-    parser.add_argument(
-        "--set",
-        metavar="table.key=value",
-        action="append",
-        default=[],
-        dest="overrides",
-        help="change one key of the configuration, such as optimizer.iterations=50; may be repeated",
-    )
+    console.add_overrides(parser, "optimizer.iterations=50")
 
     # ---- One of several things to do
     instead = parser.add_mutually_exclusive_group()

@@ -71,10 +71,11 @@ def _sun(arguments):
     latitude, longitude = arguments.place
     if not (abs(latitude) <= 90 and abs(longitude) <= 360):
         raise ConfigError(f"--place: got {latitude:g} {longitude:g}, expected degrees")
-    sun = sun_position.sun_position(latitude, longitude, sun_position.moment(arguments.date))
-    if sun.elevation < 0:
+    moment = sun_position.moment(arguments.date)
+    azimuth, elevation = sun_position.sun_position(latitude, longitude, moment)
+    if elevation < 0:
         raise ConfigError(
-            f"the sun is {-sun.elevation:.1f} degrees below the horizon there and then: "
+            f"the sun is {-elevation:.1f} degrees below the horizon there and then: "
             "the analytic sky has no night"
         )
-    return sun.azimuth, sun.elevation
+    return azimuth, elevation

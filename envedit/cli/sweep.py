@@ -5,13 +5,13 @@ from __future__ import annotations
 import argparse
 import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 from envedit import sweep as sweeps
 from envedit.cli import console
 
 
-def main(argv: list[str] | None = None, command: Sequence[str] = ()) -> int:
+def main(argv: list[str] | None = None) -> int:
     """Carry out jobs; returns the exit code: 0, 1 if a job is not done, 2, 3 as ``envedit run``, 130."""
     parser = console.make_parser(
         "sweep",
@@ -41,7 +41,6 @@ def main(argv: list[str] | None = None, command: Sequence[str] = ()) -> int:
             workers=arguments.workers,
             scheduler=arguments.scheduler,
             threads=arguments.threads,
-            command=command,
             stream=stream,
         )
         missing = [outcome for outcome in outcomes if outcome.state not in ("done", "skipped")]

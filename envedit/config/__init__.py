@@ -1,7 +1,7 @@
 """Configuration: TOML to frozen dataclasses, with presets, checks and errors that name the key."""
 
 from envedit.config.input_schema import TARGET_KINDS
-from envedit.config.reading import from_dict, load, loads, parse_override
+from envedit.config.reading import from_dict, load, loads
 from envedit.config.schema import (
     Config,
     Fit,
@@ -10,7 +10,6 @@ from envedit.config.schema import (
     Loss,
     Optimizer,
     Output,
-    Perceptual,
     Renderer,
     Representation,
     Scene,
@@ -28,7 +27,6 @@ __all__ = [
     "Loss",
     "Optimizer",
     "Output",
-    "Perceptual",
     "Renderer",
     "Representation",
     "Scene",
@@ -36,7 +34,6 @@ __all__ = [
     "from_dict",
     "load",
     "loads",
-    "parse_override",
     "quote",
     "to_toml",
     "unused",

@@ -109,8 +109,7 @@ class LightList(Tables):
     def _entry(self, name: str, light: dict[str, Any]) -> dict[str, Any]:
         keys = OWN if "light" in light else ADDED
         for unknown in (k for k in light if k not in keys):
-            known = ", ".join(dict.fromkeys(["light", *keys]))
-            hint = meant(unknown, keys, f"known: {known}")
+            hint = meant(unknown, dict.fromkeys(["light", *keys]))
             raise ConfigError(f"{name}: has no key {show(unknown)}; {hint}")
         found = {
             key: named(f"{name}.{key}", check, light[key]) for key, check in keys.items() if key in light

@@ -78,7 +78,8 @@ _PATHS = (
 )  # fmt: skip
 
 
-_MAPS = "auto", "scene", "sunsky"  # words that ``[input] envmap`` takes in place of a file
+MAP_WORDS = "auto", "scene", "sunsky"
+"""What ``[input] envmap`` takes in place of a file."""
 
 
 def checked_layer(layer: Any, where: str, top: Fields, tables: dict[str, Fields]) -> dict[str, Any]:
@@ -167,7 +168,7 @@ def resolve_paths(merged: dict[str, Any], base: Path, stem: str) -> None:
     for table, key in _PATHS:
         value = merged.get(table, {}).get(key, "")
         shipped = table == "scene" and Path(value).name == value and not Path(value).suffix
-        if value and not shipped and not (key == "envmap" and value in _MAPS):
+        if value and not shipped and not (key == "envmap" and value in MAP_WORDS):
             several = isinstance(value, tuple)
             found = tuple(v and str(base / v) for v in value) if several else str(base / value)
             merged[table] = merged[table] | {key: found}

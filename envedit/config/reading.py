@@ -33,24 +33,11 @@ _LONG_KEY = re.compile(r"""(?<![\w-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+
 def load(path: str | PathLike[str], preset: str | None = None, overrides: Iterable[str] = ()) -> Config:
     """Read a configuration file.
 
-    Parameters
-    ----------
-    path : path
-        TOML file, UTF-8. Relative paths in it, and in overrides, are relative to its folder.
-    preset : str, optional
-        Beats the preset that the file or an override names.
-    overrides : iterable of str
-        ``"table.key=value"``, later ones beat earlier ones. The value is TOML; what is not TOML is a string.
-
-    Returns
-    -------
-    Config
-        Resolved: every path absolute, ``output.dir`` filled in.
-
-    Raises
-    ------
-    ConfigError
-        The file cannot be read, is not TOML, or holds an unknown key or an unusable value.
+    ``path`` is TOML in UTF-8; relative paths in it, and in overrides, are relative to its folder. ``preset``
+    beats the one that the file or an override names. ``overrides`` are ``"table.key=value"``, of which later
+    ones beat earlier ones; the value is TOML, and what is not TOML is a string. The result is resolved: every
+    path absolute, ``output.dir`` filled in. ConfigError if the file cannot be read, is not TOML, or holds an
+    unknown key or an unusable value.
     """
     try:
         with opened(path) as file:

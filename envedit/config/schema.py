@@ -119,13 +119,21 @@ class Config(Table):
         chosen = self.representation.kind, self.renderer.kind
         return chosen == ("layers", "transport") and self.optimizer.kind != "adam"
 
+    @property
+    def given_tables(self) -> dict[str, dict[str, Any]]:
+        """What was given of each table: values by key."""
+        return {name: getattr(self, name).given_values for name in FIELDS}
+
+    @property
+    def defaults(self) -> dict[str, dict[str, Any]]:
+        """The preset's defaults of each table, for the representation and the target that there are."""
+        return presets.defaults(self.preset, self.given_tables)
+
     def _check_together(self) -> None:
         """Put the preset's defaults in the place of what was not given, however the tables were made."""
-        tables = {name: getattr(self, name) for name in FIELDS}
-        given = {name: {key: getattr(table, key) for key in table.given} for name, table in tables.items()}
-        chosen = presets.defaults(self.preset, given)
-        for name, table in tables.items():
-            object.__setattr__(self, name, table.with_defaults(chosen.get(name, {})))
+        chosen = self.defaults
+        for name in FIELDS:
+            object.__setattr__(self, name, getattr(self, name).with_defaults(chosen.get(name, {})))
         if self.optimizer.kind == "gauss-newton" and not self.newton:
             raise ConfigError(
                 'optimizer.kind: got "gauss-newton", expected adam or auto: it solves for layers '

@@ -58,10 +58,14 @@ class Table:
         object.__setattr__(table, "given", frozenset([*known[: len(values)], *named]))
         return table
 
+    @property
+    def given_values(self) -> dict[str, Any]:
+        """The fields of :attr:`given` with their values, by name."""
+        return {name: getattr(self, name) for name in sorted(self.given)}
+
     def with_defaults(self, values: Mapping[str, Any]) -> Self:
         """Return the table with other defaults; what was given stays."""
-        own = {name: getattr(self, name) for name in self.given}
-        table = type(self)(**{**values, **own})
+        table = type(self)(**{**values, **self.given_values})
         object.__setattr__(table, "given", self.given)
         return table
 

@@ -4,30 +4,25 @@ from __future__ import annotations
 
 from typing import Any
 
-from envedit.config import presets
 from envedit.config.schema import FIELDS, TOP, Config
 from envedit.config.tables import When
 from envedit.config.toml import quote
 from envedit.config.validators import Choice, String
-
-GAUSS_NEWTON, ADAM = "gauss-newton", "adam"
 
 
 def unused(config: Config, solver: str | None = None) -> list[str]:
     """Name the keys that were given, differ from their default, and change nothing: a sentence each reason.
 
     A key that has its default's value is not named: a resolved configuration, which has every key, is as
-    quiet as the one that it came from. Neither is what is switched off. ``solver`` is :data:`GAUSS_NEWTON` or
-    :data:`ADAM`, the steps that are made; None: not known, and not looked at.
+    quiet as the one that it came from. Neither is what is switched off. ``solver`` is what makes the steps,
+    "gauss-newton" or "adam"; None: not known, and not looked at.
     """
-    tables = {name: getattr(config, name) for name in FIELDS}
-    given = {name: {key: getattr(table, key) for key in table.given} for name, table in tables.items()}
-    chosen = presets.defaults(config.preset, given)
+    defaults = config.defaults
     found: dict[str, list[str]] = {}
-    for name in FIELDS:
-        default = type(tables[name])(**chosen.get(name, {}))
-        for key in sorted(given[name]):
-            if given[name][key] is False or given[name][key] == getattr(default, key):
+    for name, given in config.given_tables.items():
+        default = type(getattr(config, name))(**defaults.get(name, {}))
+        for key, value in given.items():
+            if value is False or value == getattr(default, key):
                 continue
             if reason := _reason(config, conditions(name, key), solver):
                 found.setdefault(reason, []).append(f"{name}.{key}")

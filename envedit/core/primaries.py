@@ -8,6 +8,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from envedit.core.errors import InputError
+from envedit.core.rows import bands
 
 Chromaticities = tuple[float, ...]
 """x and y of red, green, blue and white (CIE 1931), as the OpenEXR attribute orders them."""
@@ -36,7 +37,6 @@ NAMES = {
     "lin_ciexyzd65_scene": XYZ, "cie xyz-d65 - scene-referred": XYZ,
 }  # fmt: skip
 """Chromaticities by the names that programs write into a file, in small letters."""
-_ROWS = 256  # that are converted at a time
 _SAYING_NOTHING = {"unknown", "raw", "data", "none", "unspecified", "default", "non-color", "utility - raw"}
 SAME = 2e-3
 """Chromaticities that differ by no more are the same: programs write few digits."""
@@ -114,8 +114,7 @@ def converted(image: np.ndarray, matrix: np.ndarray) -> np.ndarray:
     """Multiply the colours of an image (H, W, 3) by a matrix; float32, infinite where it is too large."""
     result = np.empty(image.shape, np.float32)
     with np.errstate(over="ignore", invalid="ignore"):
-        for first in range(0, len(image), _ROWS):  # a large map is not copied as float64
-            band = slice(first, first + _ROWS)
+        for band in bands(len(image)):  # a large map is not copied as float64
             result[band] = image[band].astype(np.float64) @ matrix.T
     return result
 

@@ -2,7 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+
+BAND_ROWS = 256
+"""Rows of a map that are worked on at a time, where all of it in double precision would take gigabytes."""
+
+
+def bands(height: int, rows: int = BAND_ROWS) -> Iterator[slice]:
+    """Yield all rows of a map, some at a time."""
+    for first in range(0, height, rows):
+        yield slice(first, min(first + rows, height))
 
 
 @dataclass(frozen=True)

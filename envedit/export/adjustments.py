@@ -14,6 +14,7 @@ from envedit import config
 from envedit.core import latlong
 from envedit.core.color import luminance
 from envedit.core.errors import NumericalError
+from envedit.core.rows import bands
 from envedit.representations.layers import file_lights
 from envedit.targets.strokes import gains
 
@@ -27,7 +28,6 @@ SEARCH_WIDTH = 1024
 columns a spread takes seconds and a search ten of them."""
 GROWTH = 1.05
 """Factor on that radius while the map at its own resolution is still above the bound."""
-_ROWS = 256  # of a map that are worked on at a time
 _NOTHING = 1e-9  # share of a peak that is rounding of a transform
 
 
@@ -60,8 +60,8 @@ def adjust(
     # ---- The map times it, in double precision, some rows at a time
     result = np.empty(envmap.shape, np.float32)
     with np.errstate(over="ignore"):
-        for first in range(0, len(envmap), _ROWS):
-            result[first : first + _ROWS] = envmap[first : first + _ROWS] * gain
+        for rows in bands(len(envmap)):
+            result[rows] = envmap[rows] * gain
     if not np.isfinite(result).all():
         raise NumericalError("the adjusted map leaves float32: lower output.exposure")
     if lights.soften_degrees or lights.max_radiance:

@@ -51,31 +51,19 @@ def carry(
     and a mixture between. The ratio is interpolated; the others are linear within each working texel, with
     its value as their mean. Then the ratio is corrected until the means agree, at last texel by texel.
 
-    Parameters
-    ----------
-    representation, params
-        Of the working map's active rows, as edited.
-    original_working, edited_working : ndarray (h, w, 3)
-        The working map before and after; the first is the source resized. Of layers only
-        their shape is used.
-    source : ndarray (H, W, 3) float32
-        Linear radiance, finite and not negative.
-    rows_working : Rows
-        Active rows of the working map.
-    free : ndarray of bool (rows, w), optional
-        Active working texels that may change at all; None: all. Layers know which keep their gain
-        (:meth:`.layers.Layers.keeping`): a light may move across those.
+    ``representation`` and ``params`` are of the working map's active rows, ``rows_working``, as edited.
+    ``original_working`` and ``edited_working`` (h, w, 3) are the working map before and after; the first is
+    the source resized. Of layers only their shape is used. ``source`` (H, W, 3) float32 is linear radiance,
+    finite and not negative. ``free`` (rows, w) says which active working texels may change at all; None: all.
+    Layers know which keep their gain (:meth:`.layers.Layers.keeping`): a light may move across those.
 
-    Returns
-    -------
-    ndarray (H, W, 3) float32
-        Texels of inactive rows, of working texels that are not free, and wherever the edit is the factor 1
-        have the bits of ``source``. For other representations than layers so has every source texel that
-        overlaps an unchanged working texel, and the mean of every changed one (:func:`.latlong.resize` of the
-        result) differs from ``edited_working`` by at most 1 % of the brightest of it and its neighbours, if
-        the source is at least four times as wide; one that touches an unchanged texel cannot be darkened
-        where a source texel lies in both. A source that is not larger than the working map takes
-        the edited map's values, resized, where it was changed.
+    Returns (H, W, 3) float32. Texels of inactive rows, of working texels that are not free, and wherever the
+    edit is the factor 1 have the bits of ``source``. For other representations than layers so has every
+    source texel that overlaps an unchanged working texel, and the mean of every changed one
+    (:func:`.latlong.resize` of the result) differs from ``edited_working`` by at most 1 % of the brightest of
+    it and its neighbours, if the source is at least four times as wide; one that touches an unchanged texel
+    cannot be darkened where a source texel lies in both. A source that is not larger than the working map
+    takes the edited map's values, resized, where it was changed.
     """
     # ---- The edit, as layers or as a ratio of the working maps
     width = np.shape(edited_working)[1]

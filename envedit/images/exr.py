@@ -11,8 +11,8 @@ import numpy as np
 
 from envedit.core.atomic_files import replacing
 from envedit.core.errors import InputError
+from envedit.core.machine import cores
 from envedit.core.primaries import REC709, Chromaticities
-from envedit.core.processor import cores
 from envedit.core.quiet_libraries import quiet_libraries
 from envedit.core.types import Info
 from envedit.images.headers import MAX_TEXELS, check_declared, damaged, shown

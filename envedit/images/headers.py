@@ -8,12 +8,10 @@ exception.
 
 from __future__ import annotations
 
-import os
-import stat
-
 import numpy as np
 
-from envedit.core.errors import EnveditError, InputError, NumericalError, place_of
+from envedit.core.atomic_files import opened
+from envedit.core.errors import InputError, NumericalError, place_of
 from envedit.core.types import ArrayLike
 
 MAX_SIDE = 32768
@@ -24,18 +22,13 @@ MAX_TEXELS = 2**27
 def head_of(name: str) -> bytes:
     """Return the first bytes of a regular file."""
     try:
-        mode = os.stat(name).st_mode
-        if stat.S_ISDIR(mode):
-            raise InputError(f"{name}: is a folder; name an image file")
-        if not stat.S_ISREG(mode):  # opening a pipe would wait for ever
-            raise InputError(f"{name}: is not a regular file; name an image file")
-        with open(name, "rb") as file:
+        with opened(name) as file:
             head = file.read(1 << 16)
+    except IsADirectoryError:
+        raise InputError(f"{name}: is a folder; name an image file") from None
     except FileNotFoundError:
         raise InputError(f"{name}: no such file; check the path") from None
     except (OSError, ValueError) as e:
-        if isinstance(e, EnveditError):
-            raise
         raise InputError(f"{name}: cannot be read ({getattr(e, 'strerror', None) or e})") from None
     if not head:
         raise InputError(f"{name}: the file is empty; export or download it again")

@@ -43,23 +43,13 @@ def read(path: FilePath) -> tuple[np.ndarray, dict]:
     whose sRGB curve is undone, but of a TIFF of floats. Marks of the file are honoured (:mod:`.marks`); what
     is transparent in a PNG or TIFF is dark. Values are as stored: they may be negative or not finite.
 
-    Returns
-    -------
-    image : array (H, W, 3) float32
-        Linear radiance.
-    info : dict
-        ``path`` (str), ``format`` ("exr", "hdr", "png", "jpeg" or "tiff"), ``size`` (width, height), ``hdr``
-        (False for 8- and 16-bit pictures, which have ``bits``), ``metadata`` (dict of str, int and float),
-        ``chromaticities`` (of the file's colours; None: Rec. 709) and ``warnings`` (list of str). Of OpenEXR
-        also ``half``: whether its values are.
+    Returns the image (H, W, 3) float32, and of the file: ``path`` (str), ``format`` ("exr", "hdr", "png",
+    "jpeg" or "tiff"), ``size`` (width, height), ``hdr`` (False for 8- and 16-bit pictures, which have
+    ``bits``), ``metadata`` (dict of str, int and float), ``chromaticities`` (of the file's colours; None:
+    Rec. 709) and ``warnings`` (list of str). Of OpenEXR also ``half``: whether its values are.
 
-    Raises
-    ------
-    InputError
-        If the file is missing, empty, truncated, of another kind, or declares more than 32768 texels on a
-        side or 2^27 in all.
-    MachineError
-        If it is a TIFF and tifffile is not installed.
+    InputError if the file is missing, empty, truncated, of another kind, or declares more than 32768 texels
+    on a side or 2^27 in all; MachineError if it is a TIFF and tifffile is not installed.
     """
     image, info = _decode(path, stored=False)
     return marks.in_rec709(image, info), info
@@ -68,15 +58,11 @@ def read(path: FilePath) -> tuple[np.ndarray, dict]:
 def read_stored(path: FilePath) -> tuple[np.ndarray, dict]:
     """Read an image file as it was painted: with alpha, with its display curve; errors as of :func:`read`.
 
-    Returns
-    -------
-    pixels : array (H, W, C)
-        float32 linear radiance for OpenEXR and Radiance; uint8 or uint16 codes of display values for PNG,
-        JPEG and TIFF. C is 1 (grey), 2 (grey and alpha), 3 (RGB) or 4 (RGB and alpha). Alpha is
-        premultiplied in OpenEXR and straight in PNG, by convention.
-    info : dict
-        As of :func:`read`; ``metadata`` holds a PNG's texts. A JPEG also has ``quality``, as libjpeg
-        counts it, estimated from its first table.
+    Returns pixels (H, W, C), and ``info`` as of :func:`read`. They are float32 linear radiance for OpenEXR
+    and Radiance, and uint8 or uint16 codes of display values for PNG, JPEG and TIFF. C is 1 (grey), 2 (grey
+    and alpha), 3 (RGB) or 4 (RGB and alpha). Alpha is premultiplied in OpenEXR and straight in PNG, by
+    convention. ``metadata`` holds a PNG's texts. A JPEG also has ``quality``, as libjpeg counts it, estimated
+    from its first table.
     """
     pixels, info = _decode(path, stored=True)
     return marks.in_rec709(pixels, info), info
@@ -125,35 +111,17 @@ def load_envmap(
 ) -> tuple[np.ndarray, dict]:
     """Read a lat-long environment map, check it, and bring it to a working width.
 
-    Parameters
-    ----------
-    path : path-like or ndarray (H, 2 H, 3)
-        An image of 2:1, or its linear radiance; one that a texel's rounding made odd is resampled.
-    width : int, optional
-        Working width in texels, even and at least 6; the height is half of it. Without, the file's own size.
-    repair : bool
-        Mend NaN and infinite texels (:func:`.radiance.repair`) instead of refusing them.
-    convert : bool
-        To Rec. 709; otherwise colours are those of the file, ``info["chromaticities"]``.
-    name : str
-        What errors call an array.
-    space : str
-        Colour space of the values, a name of :data:`.primaries.SPACES`; "auto": as the file says.
+    ``path`` is an image of 2:1, or its linear radiance (H, 2 H, 3), which errors call ``name``; one that a
+    texel's rounding made odd is resampled. ``width`` is the working width in texels, even and at least 6, the
+    height half of it; None: the file's own size. ``repair`` mends NaN and infinite texels
+    (:func:`.radiance.repair`) instead of refusing them. Colours are converted to Rec. 709, unless ``convert``
+    is False: then they are those of the file, ``info["chromaticities"]``. ``space`` is the colour space of
+    the values, a name of :data:`.primaries.SPACES`; "auto": as the file says.
 
-    Returns
-    -------
-    image : array (width / 2, width, 3) float32
-        Linear radiance, finite and not negative.
-    info : dict
-        As of :func:`read` (``size`` is the file's), with ``repaired`` and ``clipped`` (numbers of texels).
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read, is not 2:1 to a texel, is smaller than 6 x 3, or holds texels that are not
-        finite.
-    ConfigError
-        If ``width`` is odd or less than 6.
+    Returns linear radiance (width / 2, width, 3) float32, finite and not negative, and ``info`` as of
+    :func:`read` (``size`` is the file's), with ``repaired`` and ``clipped``, numbers of texels. InputError if
+    the file cannot be read, is not 2:1 to a texel, is smaller than 6 x 3, or holds texels that are not
+    finite; ConfigError if ``width`` is odd or less than 6.
     """
     if width is not None and (width < 6 or width % 2 or width > MAX_SIDE):
         raise ConfigError(f"width of the environment map must be even, from 6 to {MAX_SIDE}, got {width}")
@@ -261,20 +229,13 @@ def _remedy(image, info):
 
 def _of_array(values: np.ndarray, name: str, space: str) -> tuple[np.ndarray, dict]:
     """Take a map from an array as :func:`read` takes one from a file."""
-    if values.ndim != 3 or values.shape[2] != 3 or values.dtype.kind not in "fiu":
+    if values.ndim != 3 or values.shape[2] != 3:
         what = f"shape {values.shape} of {values.dtype}"
         raise InputError(f"{name}: got an array of {what}, expected (H, 2 H, 3) numbers")
-    with np.errstate(over="ignore"):  # what leaves float32 becomes infinite, and is named as such
-        image = np.array(values, np.float32)
-    size = image.shape[1], image.shape[0]
+    size = values.shape[1], values.shape[0]
     info: Info = {"path": name, "format": None, "size": size, "hdr": True, "metadata": {}, "warnings": []}
     info["marks"] = {}
-    if values.dtype in (np.uint8, np.uint16):
-        info["warnings"].append(
-            f"an array of {values.dtype} is taken as linear radiance: codes of a picture have to be "
-            f"divided by {np.iinfo(values.dtype).max}, and their curve undone, before"
-        )
-    return marks.honour(image, info, space), info
+    return marks.honour(values.astype(np.float32), info, space), info
 
 
 # ---- Writing -----------------------------------------------------------------------------------------------

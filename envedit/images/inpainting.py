@@ -11,6 +11,7 @@ import numpy as np
 
 from envedit.core import latlong
 from envedit.core.extras import required
+from envedit.core.rows import bands
 
 MOST_PIXELS = 1024
 """Pixels across of the projection: a larger one takes seconds, and what is filled in is smooth."""
@@ -67,20 +68,20 @@ def filled(envmap: np.ndarray, weight: np.ndarray) -> np.ndarray:
 
     # ---- The region's texels of it
     result = envmap.copy()
-    for first in range(0, height, ROWS):
-        rows, columns = np.nonzero(mask[first : first + ROWS])
+    for band in bands(height, ROWS):
+        rows, columns = np.nonzero(mask[band])
         if not len(rows):
             continue
-        toward = latlong.directions(height, width, slice(first, min(first + ROWS, height)))[rows, columns]
+        toward = latlong.directions(height, width, band)[rows, columns]
         x, y, z = (toward @ frame.T).T
         across = np.hypot(x, y)
         stretch = np.arctan2(across, z) / np.maximum(across, 1e-12) / pixel
         place = np.clip(np.stack([y, x]) * stretch + half, 0, 2 * half)
         corners, shares = _around(place, image.shape[:2], wrap=False)
         filling = sum(share[:, None] * image[at] for at, share in zip(corners, shares, strict=True))
-        share = weight[first + rows, columns][:, None]
-        old = envmap[first + rows, columns]
-        result[first + rows, columns] = np.where(share == 1, filling, old + share * (filling - old))
+        share = weight[band][rows, columns][:, None]
+        old = envmap[band][rows, columns]
+        result[band][rows, columns] = np.where(share == 1, filling, old + share * (filling - old))
     return result
 
 

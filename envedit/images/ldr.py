@@ -108,10 +108,10 @@ def _png_marks(name, info):
                 info["metadata"][key.decode("latin-1")] = text.decode("latin-1")
 
 
-def _inflated(data, most=1 << 22):
+def _inflated(data):
     """Decompress a PNG's chunk, of at most 4 MiB; nothing if it is damaged."""
     try:
-        return zlib.decompressobj().decompress(data, most)
+        return zlib.decompressobj().decompress(data, 1 << 22)
     except zlib.error:
         return b""
 

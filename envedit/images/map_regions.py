@@ -22,6 +22,7 @@ from envedit.core import latlong
 from envedit.core.errors import ConfigError
 from envedit.core.radiance import BRIGHTEST, require_radiance
 from envedit.core.resampling import smooth_step
+from envedit.core.rows import bands
 from envedit.images import inpainting
 
 ROWS = 128
@@ -86,8 +87,7 @@ def _weight(region: Region, height: int, width: int) -> np.ndarray:
     weight = np.empty((height, width), np.float32)
     texel = np.degrees(max(np.pi / max(height - 1, 1), 2 * np.pi / width))
     fade = max(region["softness"], texel)
-    for first in range(0, height, ROWS):
-        band = slice(first, min(first + ROWS, height))
+    for band in bands(height, ROWS):
         if "points" in region:
             inwards = _within_brush(region["points"], region["radius"], fade, (height, width), band)
         else:

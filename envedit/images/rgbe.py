@@ -7,6 +7,7 @@ import re
 import numpy as np
 
 from envedit.core.errors import InputError
+from envedit.core.rows import bands
 from envedit.core.types import Info
 from envedit.images.headers import check_declared, damaged
 
@@ -140,8 +141,8 @@ def encode(image: np.ndarray, chromaticities: tuple[float, ...] | None = None) -
     head = f"#?RADIANCE\n{space}FORMAT=32-bit_rle_rgbe\n\n-Y {height} +X {width}\n".encode()
     start = bytes((2, 2, width >> 8 & 255, width & 255))
     rows = [head]
-    for first in range(0, height, _ROWS):
-        texels = _texels(image[first : first + _ROWS])
+    for band in bands(height):
+        texels = _texels(image[band])
         if not 8 <= width < 32768:  # too short or long for scanlines by channel
             rows.append(texels.tobytes())
             continue
@@ -167,5 +168,4 @@ def _texels(image):
     return texels
 
 
-_ROWS = 256  # that are encoded at a time
 _LARGEST = 2.0**127 * (255 / 256)

@@ -9,11 +9,10 @@ import numpy as np
 from envedit import config
 from envedit.core.color import luminance
 from envedit.core.rotations import Orientation
+from envedit.core.rows import bands
 from envedit.export import adjustments
 from envedit.maps import sphere
 from envedit.representations.layers.oriented import oriented
-
-_ROWS = 256  # of a map that are worked on at a time
 
 
 @dataclass(frozen=True)
@@ -67,8 +66,7 @@ def adjusted(radiance: np.ndarray, how: Adjustments) -> tuple[np.ndarray, list[s
 def saturated(radiance: np.ndarray, factor: float) -> np.ndarray:
     """Scale the distance of colours (H, W, 3) from grey: max(L + s (E - L), 0) of luminance L, float32."""
     result = np.empty_like(radiance)
-    for first in range(0, len(radiance), _ROWS):
-        rows = slice(first, first + _ROWS)
+    for rows in bands(len(radiance)):
         grey = luminance(radiance[rows])[..., None]
         result[rows] = np.maximum(grey + factor * (radiance[rows] - grey), 0)
     return result

@@ -13,6 +13,7 @@ import numpy as np
 
 from envedit.core import latlong
 from envedit.core.rotations import rotated, rotation_between, rotation_matrix, rotation_vector
+from envedit.core.rows import bands
 from envedit.export import light_list
 from envedit.representations.layers import file_lights, oriented
 from envedit.representations.layers.separation import GLOW_DEGREES, Light, glow_at
@@ -53,8 +54,7 @@ def blend(first: np.ndarray, second: np.ndarray, amount: float) -> tuple[np.ndar
 
     # ---- Backgrounds in log radiance, and the glows where the lights are
     height, width = first.shape[:2]
-    for top in range(0, height, _ROWS):
-        rows = slice(top, top + _ROWS)
+    for rows in bands(height, _ROWS):
         directions = latlong.directions(height, width, rows).astype(np.float32)
         log_sky = np.zeros_like(first[rows])
         for envmap, own_lights, e, weight in zip(maps, lights, offset, share, strict=True):

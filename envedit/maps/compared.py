@@ -28,12 +28,9 @@ def reduced(radiance: np.ndarray) -> np.ndarray:
 def pictures(first: np.ndarray, second: np.ndarray) -> dict:
     """Compare a reduced map with a reduced reference of the same size (H, W, 3), as pictures and as light.
 
-    Returns
-    -------
-    dict
-        ``psnr``, ``ssim``, ``lpips``, ``log_rmse``, ``beyond_display`` of :func:`.metrics.compare`, ``lpips``
-        None without trained weights; ``width``; ``irradiance``: by axis, luminance ``first`` and ``second``,
-        and ``stops``, log2 of the second over the first ("+y" is the horizontal plane).
+    Returns ``psnr``, ``ssim``, ``lpips``, ``log_rmse``, ``beyond_display`` of :func:`.metrics.compare`,
+    ``lpips`` None without trained weights; ``width``; ``irradiance``: by axis, luminance ``first`` and
+    ``second``, and ``stops``, log2 of the second over the first ("+y" is the horizontal plane).
     """
     measured = metrics.compare(second, first, lpips=installed.load(config.Config()).lpips)
     return measured | {"width": first.shape[1], "irradiance": _irradiance(first, second)}

@@ -13,7 +13,6 @@ import math
 import os
 import tomllib
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -250,7 +249,8 @@ def read(path: FilePath) -> Look:
     cannot be read.
     """
     try:
-        return parse(Path(path).read_text(encoding="utf-8"), os.fsdecode(path))
+        with atomic_files.opened(path) as file:
+            return parse(file.read().decode(), os.fsdecode(path))
     except OSError as error:
         raise InputError(f"{path}: {error.strerror}") from None
     except UnicodeDecodeError as error:

@@ -10,15 +10,16 @@ from pathlib import Path
 import numpy as np
 
 from envedit import config, inputs
+from envedit.core import primaries
 from envedit.core.errors import ConfigError
 from envedit.core.radiance import HALF_MAX
+from envedit.core.rows import bands
 from envedit.core.types import FilePath
 from envedit.images import images
 from envedit.inputs import InputMap
 
 EXR, HDR = ".exr", ".hdr"
 """Endings of the files that are written."""
-_ROWS = 256  # that are converted at a time
 
 
 def read(path: FilePath, repair: bool = False) -> InputMap:
@@ -45,8 +46,7 @@ def as_stored(edited: np.ndarray, like: InputMap) -> np.ndarray:
         return edited
     result = np.empty(edited.shape, np.float32)
     stored = like.stored if like.stored.shape == edited.shape else np.zeros_like(edited)
-    for first in range(0, len(edited), _ROWS):
-        rows = slice(first, first + _ROWS)
+    for rows in bands(len(edited)):
         result[rows] = replace(like, stored=stored[rows]).as_stored(edited[rows])
     return result
 
@@ -84,26 +84,37 @@ def output_path(
     return path
 
 
-def write(path: FilePath, values: np.ndarray, like: InputMap | None = None) -> list[str]:
+def write(
+    path: FilePath,
+    values: np.ndarray,
+    like: InputMap | None = None,
+    half: bool | None = None,
+    rec709: bool = False,
+    remedy: str = "write it as .hdr, or darken the map",
+) -> list[str]:
     """Write a map, by the ending of its name as OpenEXR or Radiance; returns warnings: what half cannot hold.
 
-    ``values`` (H, W, 3) are linear, in the colours of ``like``, the map that was read: OpenEXR is half where
-    its file is, and its chromaticities are those of the result. None: float, Rec. 709. ConfigError if the
-    path is that of ``like``, NumericalError if a value is not finite, InputError if the file cannot be
-    written.
+    ``values`` (H, W, 3) are linear, in the colours of ``like``, the map that was read, whose chromaticities
+    are those of the result; with ``rec709`` they are converted. None: Rec. 709. ``half`` is for OpenEXR; by
+    default as the file of ``like``, otherwise float. ``remedy`` ends the warning. ConfigError if the path is
+    that of ``like``, NumericalError if a value is not finite, InputError if the file cannot be written.
     """
     path = Path(os.fsdecode(path))
     if like is not None and os.path.realpath(path) == os.path.realpath(like.source):
         raise ConfigError(f"{path}: is the map that was read: give another name")
     space = None if like is None else like.chromaticities
+    if rec709 and space is not None:
+        values = primaries.converted(values, primaries.to_rec709(space))
+        space = None
     if path.suffix.lower() == HDR:
         images.write_hdr(path, values, space)
         return []
     marks = {} if like is None else {"source": like.source}
-    half = like is not None and like.half
+    if half is None:
+        half = like is not None and like.half
     warnings: list[str] = []
     if half:
-        values, warnings = cut_to_half(values, path, "write it as .hdr, or darken the map")
+        values, warnings = cut_to_half(values, path, remedy)
     images.write_exr(path, values, marks, half=half, chromaticities=space)
     return warnings
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import datetime
 import math
-from dataclasses import dataclass
 
 from envedit.core.errors import ConfigError
 
@@ -17,15 +16,6 @@ YEARS = 1800, 2200
 minutes, in which the sun moves by 0.005 degrees along the ecliptic. Derived."""
 PARALLAX_DEGREES = 8.794 / 3600
 """The sun's horizontal parallax."""
-
-
-@dataclass(frozen=True)
-class SunPosition:
-    """Where the sun is seen."""
-
-    azimuth: float  # degrees from north by east, in [0, 360)
-    # Degrees above the horizon, raised by refraction (10 degrees Celsius, 1010 hPa) down to -1 degree
-    elevation: float
 
 
 def moment(text: str) -> datetime.datetime:
@@ -45,8 +35,12 @@ def moment(text: str) -> datetime.datetime:
     return time.astimezone(datetime.UTC)
 
 
-def sun_position(latitude: float, longitude: float, time: datetime.datetime) -> SunPosition:
-    """Compute where the sun is seen at a latitude and longitude in degrees, north and east positive."""
+def sun_position(latitude: float, longitude: float, time: datetime.datetime) -> tuple[float, float]:
+    """Compute where the sun is seen at a latitude and longitude in degrees, north and east positive.
+
+    Returns its azimuth, degrees from north by east in [0, 360), and its elevation, degrees above the horizon,
+    raised by refraction (10 degrees Celsius, 1010 hPa) down to -1 degree.
+    """
     j2000 = datetime.datetime(2000, 1, 1, 12, tzinfo=datetime.UTC)
     days = (time - j2000) / datetime.timedelta(days=1)
     t = days / 36525
@@ -74,7 +68,7 @@ def sun_position(latitude: float, longitude: float, time: datetime.datetime) -> 
     up = math.sin(phi) * math.sin(declination) + math.cos(phi) * math.cos(declination) * math.cos(hour)
     elevation = math.degrees(math.asin(max(-1.0, min(1.0, up))))
     elevation -= PARALLAX_DEGREES * math.cos(math.radians(elevation))
-    return SunPosition(azimuth % 360, elevation + _refraction(elevation))
+    return azimuth % 360, elevation + _refraction(elevation)
 
 
 def _refraction(elevation):

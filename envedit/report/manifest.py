@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import csv
 import datetime
-import importlib.metadata
 import io
 import json
 import math
@@ -21,7 +20,7 @@ from typing import Any
 import numpy as np
 
 import envedit
-from envedit.core import atomic_files, processor
+from envedit.core import atomic_files, machine
 from envedit.core.atomic_files import write_atomically
 from envedit.core.types import FilePath
 
@@ -92,16 +91,12 @@ def manifest(config_summary: dict, inputs: dict, variant: str) -> dict:
     """Collect what it takes to explain a run later: versions, machine, seeds, and the digests of its inputs.
 
     ``config_summary`` is whatever of the configuration is worth repeating; its keys that name a seed are
-    listed as ``seeds``. ``inputs`` are the files read, by role: None is left out, and a file that cannot be
-    read any more is listed with the reason. ``variant`` is Mitsuba's. ``commit`` is None unless the package
-    runs from its own git checkout.
+    listed as ``seeds``. ``inputs`` are the files read, by role; one that cannot be read any more is listed
+    with the reason. ``variant`` is Mitsuba's. ``commit`` is None unless the package runs from its own git
+    checkout.
     """
     versions: dict[str, str | None] = {"envedit": envedit.__version__, "python": platform.python_version()}
-    for package in ("mitsuba", "drjit", "numpy", "OpenEXR"):
-        try:
-            versions[package] = importlib.metadata.version(package)
-        except importlib.metadata.PackageNotFoundError:
-            versions[package] = None
+    versions |= {package: machine.version(package) for package in ("mitsuba", "drjit", "numpy", "OpenEXR")}
     return {
         "time_utc": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "versions": versions,
@@ -109,9 +104,9 @@ def manifest(config_summary: dict, inputs: dict, variant: str) -> dict:
         "variant": variant,
         "llvm": _llvm() if variant.startswith("llvm") else None,
         "platform": platform.platform(),
-        "cores": {"usable": processor.cores(), "machine": os.cpu_count()},
+        "cores": {"usable": machine.cores(), "machine": os.cpu_count()},
         "seeds": {key: value for key, value in config_summary.items() if "seed" in str(key)},
-        "inputs": {role: _digest(path) for role, path in inputs.items() if path is not None},
+        "inputs": {role: _digest(path) for role, path in inputs.items()},
         "config": config_summary,
     }
 
@@ -154,14 +149,7 @@ def _commit(root):
 def _llvm():
     """Version and file of the LLVM that Dr.Jit loaded, as far as they can be had."""
     try:
-        from drjit.detail import llvm_version
-
-        version = ".".join(map(str, llvm_version()))
+        version = machine.llvm_version()
     except Exception:  # an optional line of the manifest must not end a finished run
         version = None
-    try:
-        loaded = Path("/proc/self/maps").read_text().splitlines()
-        path = next((line.split(maxsplit=5)[-1] for line in loaded if "/libLLVM" in line), None)
-    except OSError:
-        path = os.environ.get("DRJIT_LIBLLVM_PATH")
-    return {"version": version, "path": path}
+    return {"version": version, "path": machine.llvm_library() or os.environ.get("DRJIT_LIBLLVM_PATH")}

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from envedit import config, inputs
-from envedit.core import atomic_files, primaries
+from envedit.core import atomic_files
 from envedit.core.errors import InputError
 from envedit.export import light_list
 from envedit.images import images
@@ -30,18 +30,14 @@ def write_map(
     ``path`` is the file without its ending; ``envmap`` (H, W, 3) has linear values in the units and colours
     of the file that was edited, ``input_map``.
     """
-    space = input_map.chromaticities
-    if settings.format == "hdr":  # its colours are Rec. 709 to nearly every program
-        shown = envmap if space is None else primaries.converted(envmap, primaries.to_rec709(space))
-        images.write_hdr(path.with_suffix(".hdr"), shown)
-        return []
-    name = path.with_suffix(".exr")
-    warnings: list[str] = []
-    if settings.half:
-        envmap, warnings = map_file.cut_to_half(envmap, name, "set output.half = false")
-    source = {"source": input_map.source}
-    images.write_exr(name, envmap, source, half=settings.half, chromaticities=space)
-    return warnings
+    return map_file.write(
+        path.with_suffix(f".{settings.format}"),
+        envmap,
+        input_map,
+        settings.half,
+        rec709=settings.format == "hdr",  # as nearly every program reads it
+        remedy="set output.half = false",
+    )
 
 
 def write_lights(folder: Path, result: results.Result) -> None:

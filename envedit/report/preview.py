@@ -88,17 +88,6 @@ def exposed(stops: float) -> str:
 # The preview
 
 
-def preview(
-    path: FilePath,
-    renders: Mapping[str, np.ndarray | None],
-    maps: Mapping[str, np.ndarray | None],
-    tonemap: str = "gamma",
-    views: Views = (),
-) -> None:
-    """Write ``preview.png``: what :func:`sheet` draws; InputError if it cannot be written."""
-    write_atomically(path, sheet(renders, maps, tonemap, views))
-
-
 def sheet(
     renders: Mapping[str, np.ndarray | None],
     maps: Mapping[str, np.ndarray | None],

@@ -56,13 +56,9 @@ def write(folder: Path, result: results.Result, import_s: float) -> list[str]:
     timing["import_s"] = round(import_s, 3)
     timing["total_s"] = round(timing["total_s"] + timing["import_s"] + timing["full_s"], 3)
     if settings.output.report:
-        preview.preview(
-            folder / "preview.png",
-            result.shown,
-            result.maps,
-            settings.output.tonemap,
-            views=[view.rows for view in result.views],
-        )
+        views = [view.rows for view in result.views]
+        sheet = preview.sheet(result.shown, result.maps, settings.output.tonemap, views)
+        atomic_files.write_atomically(folder / "preview.png", sheet)
         html_report.write_report(folder / "report.html", result, facts)
     timing["report_s"] = round(time.perf_counter() - maps_written, 3)
     timing["total_s"] = round(timing["total_s"] + timing["report_s"], 3)

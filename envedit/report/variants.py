@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from envedit import config, inputs
-from envedit.core.atomic_files import make_folder
+from envedit.core.atomic_files import make_folder, write_atomically
 from envedit.losses import metrics
 from envedit.report import map_files, preview
 from envedit.scene.scene import Scene
@@ -95,10 +95,10 @@ def write(
     for number, one in enumerate(variants, 1):
         warnings += map_files.write_map(settings, folder / str(number), one.envmap, input_map)
         checkpoint.save_solution(folder / f"{number}.npz", one.run)
-    preview.preview(
-        folder / SHEET,
+    sheet = preview.sheet(
         {f"{number}: {one.name}": one.render for number, one in enumerate(variants, 1)},
         {f"{number}: {one.name}": one.envmap for number, one in enumerate(variants, 1)},
         settings.tonemap,
     )
+    write_atomically(folder / SHEET, sheet)
     return warnings

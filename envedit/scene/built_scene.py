@@ -19,6 +19,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from envedit import config
 from envedit.core import latlong
 from envedit.core.errors import ConfigError, InputError
 from envedit.scene import scene as scenes
@@ -41,30 +42,33 @@ UNKNOWN = "built "
 _ANY_DEPTH = 2**32 - 1  # as Mitsuba prints a depth of -1
 
 
-def load(
-    scene: object,
-    width: int = 0,
-    height: int = 0,
-    parameters: Mapping[str, Any] | None = None,
-    base: Path | None = None,
-    sensors: str | Sequence[int | str] = (0,),
-    up: str = "auto",
-    scale: float | str = "auto",
-) -> Scene:
-    """Take a scene in any form.
+def load(scene: object, settings: config.Scene, base: Path | None = None) -> Scene:
+    """Take a scene in any form; of ``settings`` all but ``file`` counts.
 
-    ``scene`` is a file, the name of a shipped scene, a dict as ``mi.load_dict`` takes it, a Scene, or a built
-    ``mitsuba.Scene``, for which all but ``sensors`` and ``scale`` is fixed. Other parameters are those of
-    :func:`.scene.load`. ConfigError and InputError are as of it and of :func:`wrapped`, also if it is none of
-    these.
+    ``scene`` is a file, the name of a shipped scene, a mapping as ``mi.load_dict`` takes it, a Scene, which
+    is returned as it is, or a built ``mitsuba.Scene``, for which all but ``sensors`` and ``scale`` is fixed.
+    ``base`` is that of :func:`.scene.load`. ConfigError and InputError are as of it and of :func:`wrapped`,
+    also if it is none of these.
     """
     if isinstance(scene, Scene):
         return scene
+    if isinstance(scene, Mapping):
+        scene = dict(scene)
     if isinstance(scene, str | os.PathLike | dict):
-        filled = dict(parameters or {})
-        return scenes.load(scene, width, height, filled, base, sensors=sensors, up=up, scale=scale)
-    wrapped_scene = wrapped(scene, sensors)
-    return wrapped_scene if isinstance(scale, str) else replace(wrapped_scene, own=OwnMap(None, scale))
+        return scenes.load(
+            scene,
+            settings.width,
+            settings.height,
+            dict(settings.parameters),
+            base,
+            sensors=settings.sensors,
+            up=settings.up,
+            scale=settings.scale,
+        )
+    wrapped_scene = wrapped(scene, settings.sensors)
+    if isinstance(settings.scale, str):
+        return wrapped_scene
+    return replace(wrapped_scene, own=OwnMap(None, settings.scale))
 
 
 def is_built(scene: object) -> bool:

@@ -82,20 +82,11 @@ def trace(
     ``bounces``; then, with ``beyond``, one escape of all further bounces. Where the scene's integrator hides
     emitters, camera rays pass shapes that are lamps, and those that leave the scene are not active.
 
-    Parameters
-    ----------
-    scene : mi.Scene
-        Its sensors are the views.
-    pixels : ndarray of uint32
-        Indices row * width + column of the pixels to trace, the views' pictures below each other.
-    paths : int
-        Camera paths a pixel.
-    bounces : int
-        Surface points along a path (Mitsuba's ``max_depth`` - 1). With 0 only camera rays are traced.
-    seed : int
-        Seed of every random choice.
-    beyond : bool
-        Follow paths that have not left the scene by then to their end, by Russian roulette.
+    ``pixels`` are indices row * width + column of the pixels to trace, uint32, the views' pictures below each
+    other; the views are the scene's sensors. There are ``paths`` camera paths a pixel and ``bounces`` surface
+    points along each (Mitsuba's ``max_depth`` - 1); with 0 only camera rays are traced. ``seed`` is that of
+    every random choice. With ``beyond`` paths that have not left the scene by then are followed to their end,
+    by Russian roulette.
     """
     # ---- One lane for each path, with its own samples
     n = len(pixels) * paths

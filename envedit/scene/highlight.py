@@ -24,20 +24,9 @@ def direction(scene: Scene, view: int, x: float, y: float) -> np.ndarray:
     specular surfaces alone the light itself. The result is the mean of the directions that show at least
     half as much as the best one.
 
-    Parameters
-    ----------
-    scene : Scene
-        Its sensors are the views.
-    view : int
-        Index of the view.
-    x, y : float
-        Place on the picture, as shares of its width and height from the upper left corner.
-
-    Returns
-    -------
-    ndarray (3,) float64
-        Unit vector in the frame of the map. NoPlaceError if what is seen there is not glossy, or reflects
-        mostly another object.
+    ``view`` is the index of a sensor of the scene, ``x`` and ``y`` are shares of the picture's width and
+    height from the upper left corner. Returns a unit vector (3,) float64 in the frame of the map.
+    NoPlaceError if what is seen there is not glossy, or reflects mostly another object.
     """
     value, specular, bounces, leaves, toward = _followed(scene, view, x, y)
     reflected = bounces > 0

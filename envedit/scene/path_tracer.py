@@ -30,20 +30,11 @@ class PathTracer:
 
     ConfigError if there are more samples than Mitsuba can trace at once.
 
-    Parameters
-    ----------
-    scene : Scene
-        The scene; its environment map is replaced at every step.
-    spp : int
-        Samples a pixel, for the picture and again for its gradient; as many more as the scene's sampler
-        needs to fill its grid.
-    max_depth : int
-        Longest path in segments.
-    seed : int
-        Base seed; every step draws two seeds of its own from it, one for the picture and one for the
-        gradient.
-    one_thread : bool
-        Trace gradients by one thread, so that their sums have a fixed order; else by all.
+    ``spp`` samples a pixel are taken for the picture and again for its gradient, and as many more as the
+    scene's sampler needs to fill its grid. ``max_depth`` is the longest path in segments. Every step replaces
+    the scene's environment map and draws two seeds of its own from ``seed``, one for the picture and one for
+    the gradient. With ``one_thread`` gradients are traced by one thread, so that their sums have a fixed
+    order; else by all.
     """
 
     transport = None

@@ -21,7 +21,6 @@ which stay as they are.
 from __future__ import annotations
 
 import contextlib
-import difflib
 import functools
 import hashlib
 import os
@@ -34,6 +33,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from envedit.config.validators import meant
 from envedit.core import installed_plugins, latlong, shipped
 from envedit.core.color import tonemap
 from envedit.core.errors import ConfigError, EnveditError, InputError, NumericalError, place_of
@@ -303,21 +303,14 @@ def load(
     sensor is unknown, missing or unusable, or the size is. InputError if files are missing or damaged, the
     scene has several environment emitters, or something that is not supported; all that is found is named.
 
-    Parameters
-    ----------
-    file : path, str or dict
-        A Mitsuba XML file, a USD file (:func:`.usd.conversion.kept`), the name of a shipped scene
-        (:func:`.shipped.scenes`, with or without ``.xml``; a file of that name in the working folder comes
-        first), or a dict as ``mi.load_dict`` takes it.
-    width, height : int, optional
-        Size of the rendering in pixels. None or 0: the scene's own, or by its aspect if one of both is given.
-    sampler : str
-        Sampler of Mitsuba's renderings, where the scene has none or ``independent``. Stratified
-        samples, 256 a pixel, have 8 dB less noise than as many independent ones in the shipped scenes.
-    up : str
-        Axis of the map's zenith, as of :func:`.parser.replace_environment`.
-    scale : float or "auto"
-        What maps are multiplied by, in place of the ``scale`` of the emitter.
+    ``file`` is a Mitsuba XML file, a USD file (:func:`.usd.conversion.kept`), the name of a shipped scene
+    (:func:`.shipped.scenes`, with or without ``.xml``; a file of that name in the working folder comes
+    first), or a dict as ``mi.load_dict`` takes it. ``width`` and ``height`` are of the rendering, pixels;
+    None or 0: the scene's own, or by its aspect if one of both is given. ``sampler`` is that of Mitsuba's
+    renderings where the scene has none or ``independent``: stratified samples, 256 a pixel, have 8 dB less
+    noise than as many independent ones in the shipped scenes. ``up`` is the axis of the map's zenith, as of
+    :func:`.parser.replace_environment`, ``scale`` what maps are multiplied by in place of the ``scale`` of
+    the emitter.
     """
     if not (mi.variant() or "").endswith("_rgb"):
         raise ConfigError(f"variant: got {mi.variant()}, expected one that ends in _rgb, such as llvm_ad_rgb")
@@ -534,9 +527,8 @@ def find(file: FilePath) -> Path:
         return shipped.folder() / f"{name}.xml"
     if os.path.isdir(path):
         raise InputError(f"scene {file}: this is a folder, expected a Mitsuba XML or USD file")
-    close = difflib.get_close_matches(name, names, 1) if bare else []
     expected = f"expected a Mitsuba XML or USD file or one of {', '.join(names)}"
-    hint = f"did you mean {close[0]}?" if close else expected
+    hint = meant(name, names, expected) if bare else expected
     raise InputError(f"scene {file}: no such file; {hint}")
 
 
@@ -565,13 +557,10 @@ def _check_parameters(path: Path, parameters: dict) -> tuple[dict[str, str], sce
     used, defaults = outline.used, outline.defaults
     for name in parameters:
         if name not in used | defaults:
-            close = difflib.get_close_matches(str(name), used | defaults, 1)
             known = ", ".join(sorted(used | defaults)) or "none"
-            raise ConfigError(
-                f"scene.parameters: {path.name} has no parameter {name}"
-                + (f"; did you mean {close[0]}?" if close else "")
-                + f" (known: {known})"
-            )
+            hint = meant(name, used | defaults, "")
+            hint = f"; {hint}" if hint else ""
+            raise ConfigError(f"scene.parameters: {path.name} has no parameter {name}{hint} (known: {known})")
     if missing := sorted(used - defaults - parameters.keys()):
         raise ConfigError(
             f"scene.parameters: {path.name} needs {', '.join(missing)}, which has no default; give it: "

@@ -12,7 +12,7 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -110,7 +110,7 @@ def lines_of(
     try:
         output = subprocess.run(
             [sys.executable, "-P", "-c", CODE],
-            input=json.dumps([[os.fspath(folder) for folder in sys.path], module, arguments]).encode(),
+            input=request(module, arguments),
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
             timeout=_WAIT * seconds,
@@ -127,19 +127,33 @@ def lines_of(
     return lines
 
 
+def request(module: str, arguments: Sequence) -> bytes:
+    """Return what :data:`CODE` reads to run the ``main`` of a module."""
+    return json.dumps([[os.fspath(folder) for folder in sys.path], module, arguments]).encode()
+
+
 # ---- In the other process ----------------------------------------------------------------------------------
+
+
+def begin() -> Callable[[Any], None]:
+    """Select a variant of Mitsuba, and silence what libraries print of odd files.
+
+    Returns a function that writes a value as a line of JSON to the process that has started this one.
+    """
+    answers = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)
+    mi.set_variant("scalar_rgb" if "scalar_rgb" in mi.variants() else mi.variants()[0])
+    mi.set_log_level(mi.LogLevel.Error)
+    return lambda value: print(json.dumps(value), file=answers, flush=True)
 
 
 def main(files: Sequence[Sequence], seconds: int) -> None:
     """Read files in turn, and write lines of JSON: one at the beginning, and what is wrong with each file."""
-    answers = os.fdopen(os.dup(1), "w")
-    os.dup2(2, 1)  # libraries print about odd files
-    mi.set_variant("scalar_rgb" if "scalar_rgb" in mi.variants() else mi.variants()[0])
-    mi.set_log_level(mi.LogLevel.Error)
+    say = begin()
     dr.set_thread_count(2)  # on one, Mitsuba waits for ever for an EXR texture
     installed_plugins.come_first()
     limit("RLIMIT_CPU", seconds)
-    print(json.dumps("begun"), file=answers, flush=True)
+    say("begun")
     for plugin, path, shape_index in files:
         memory = IMAGE_MEMORY if plugin == "bitmap" else MEMORY + MEMORY_PER_BYTE * os.path.getsize(path)
         limit("RLIMIT_AS", address_space() + memory)
@@ -154,7 +168,7 @@ def main(files: Sequence[Sequence], seconds: int) -> None:
             else:
                 wrong = f"cannot be read as {plugin}; is this the right file? If so, export it again"
                 wrong += _HINTS.get(plugin, "")
-        print(json.dumps(wrong), file=answers, flush=True)
+        say(wrong)
 
 
 def _read(plugin, path, shape_index):

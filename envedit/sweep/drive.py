@@ -17,7 +17,7 @@ from typing import TextIO
 from envedit.core.atomic_files import make_folder, write_atomically
 from envedit.core.errors import ConfigError
 from envedit.core.extras import required
-from envedit.core.processor import cores
+from envedit.core.machine import cores
 from envedit.core.types import FilePath
 
 from .jobs import Job
@@ -37,7 +37,6 @@ def sweep(
     workers: int | None = None,
     scheduler: str | None = None,
     threads: int | None = None,
-    command: Sequence[str] = (),
     stream: TextIO | None = None,
 ) -> list[Outcome]:
     """Carry out all jobs that are not done, and report the progress.
@@ -51,34 +50,14 @@ def sweep(
        outcomes = sweep(jobs, "runs/angles")
        measured = [json.loads((job.folder("runs/angles") / "metrics.json").read_text()) for job in jobs]
 
-    Parameters
-    ----------
-    jobs : iterable of Job
-        Those of the same content are run once.
-    out : path
-        Folder of the jobs' folders; ``sweep.tsv`` in it lists names, states, seconds, folders and errors.
-    workers : int, optional
-        Jobs at a time on this machine; None: one for every four cores.
-    scheduler : str, optional
-        Address of a Dask scheduler; ``workers`` does not count then.
-    threads : int, optional
-        Threads of a job; None: the cores divided by the jobs at a time.
-    command : sequence of str
-        What carries out every job, as :data:`.process.COMMAND`; empty: what each job says.
-    stream : file, optional
-        Where a line on each job is written as it ends; None: nowhere.
+    Jobs of the same content are run once. ``out`` is the folder of the jobs' folders; ``sweep.tsv`` in it
+    lists names, states, seconds, folders and errors. There are ``workers`` jobs at a time on this machine, by
+    default one for every four cores; with a ``scheduler``, the address of Dask's, that does not count. A job
+    has ``threads`` threads, by default the cores divided by the jobs at a time. A line on each job is written
+    to ``stream`` as it ends. Returns an outcome for each of ``jobs``, in their order.
 
-    Returns
-    -------
-    list of Outcome
-        One for each of ``jobs``, in their order.
-
-    Raises
-    ------
-    ConfigError, InputError
-        Two jobs of one name; no Dask; no scheduler; a folder that cannot be used.
-    KeyboardInterrupt
-        After the running jobs have had time for their checkpoints.
+    ConfigError or InputError for two jobs of one name, no Dask, no scheduler, or a folder that cannot be
+    used; KeyboardInterrupt after the running jobs have had time for their checkpoints.
     """
     jobs = list(jobs)
     out = Path(out).absolute()
@@ -97,7 +76,7 @@ def sweep(
     # ---- Carry it out
     if to_run:
         done_before = f"{len(distinct)} jobs, {len(outcomes)} done before, {len(to_run)} to run"
-        run = functools.partial(run_job, out=out, command=tuple(command))
+        run = functools.partial(run_job, out=out)
         if scheduler is None:
             workers = min(workers or max(1, cores() // CORES_PER_JOB), len(to_run))
             engine = _on_this_machine(run, workers, threads)

@@ -12,14 +12,13 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import envedit
 from envedit.core import file_locks
 from envedit.core.atomic_files import make_folder, write_atomically
 from envedit.core.errors import InputError
-from envedit.core.processor import cores
+from envedit.core.machine import cores
 from envedit.core.types import FilePath
 
 from .jobs import Job, program
@@ -79,33 +78,15 @@ class Outcome:
 
 
 def run_job(
-    job: Job,
-    out: FilePath,
-    command: Sequence[str] = (),
-    threads: int | None = None,
-    stop: threading.Event | None = None,
+    job: Job, out: FilePath, threads: int | None = None, stop: threading.Event | None = None
 ) -> Outcome:
-    """Carry out a job unless it is done: in this thread, by a process of its own.
+    """Carry out a job, whose folder is under ``out``, unless it is done: by a process of its own.
 
-    Parameters
-    ----------
-    job : Job
-        What to do.
-    out : path
-        Folder of all jobs.
-    command : sequence of str
-        What to call in place of the job's own command, as :data:`COMMAND`. Exit code 0: done. 3 with a line
-        that says so, after it was started with a checkpoint: that is damaged or belongs to something else,
-        and is removed for a second try.
-    threads : int, optional
-        Threads of the job; None: the cores of this machine over the jobs at a time of this Dask worker.
-    stop : threading.Event, optional
-        Once it is set, the job is interrupted as by Ctrl-C and gets some seconds for its checkpoint.
-
-    Raises
-    ------
-    InputError
-        If the folder cannot be made or written to.
+    Exit code 0 of its command: done. 3 with a line that says so, after it was started with a checkpoint: that
+    is damaged or belongs to something else, and is removed for a second try. ``threads`` are those of the
+    job; None: the cores of this machine over the jobs at a time of this Dask worker. Once ``stop`` is set,
+    the job is interrupted as by Ctrl-C and gets some seconds for its checkpoint. InputError if the folder
+    cannot be made or written to.
     """
     # ---- Nothing to do, or not by this installation
     folder = job.folder(out)
@@ -120,24 +101,23 @@ def run_job(
 
     # ---- Carry it out in its folder, which no other process works in meanwhile
     make_folder(folder)
-    command = command or job.command or COMMAND
     threads = threads or max(1, cores() // _jobs_at_a_time())
     try:
         with file_locks.locked(folder / LOCK) as lock:
             if (folder / DONE).exists():
                 return Outcome(job, "skipped")
-            return _carry_out(job, folder, command, threads, stop, lock)
+            return _carry_out(job, folder, threads, stop, lock)
     except file_locks.Busy as busy:
         return Outcome(job, "held", error=str(busy))
 
 
-def _carry_out(job, folder, command, threads, stop, lock):
+def _carry_out(job, folder, threads, stop, lock):
     """Start the process, again without its checkpoint if that is unusable, and write what became of it."""
     # ---- What is run
     write_atomically(folder / CONFIG, job.toml.encode())
     (folder / FAILED).unlink(missing_ok=True)
     values = {"{python}": sys.executable, "{folder}": str(folder.absolute()), "{threads}": str(threads)}
-    argv = [_filled(part, values) for part in command]
+    argv = [_filled(part, values) for part in job.command or COMMAND]
 
     # ---- The run
     begun = time.monotonic()

@@ -28,6 +28,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from envedit import config
 from envedit.core import latlong, seeds
 from envedit.core.array_cache import DiskCache, holds
 from envedit.core.arrays import tensor
@@ -173,7 +174,7 @@ class LightTransport:
         # ---- Scene and options, checked
         if mi.variant() is None:
             mi.set_variant("llvm_ad_rgb")
-        scene = built_scene.load(scene, 0 if isinstance(scene, Scene) else 128)
+        scene = built_scene.load(scene, config.Scene())
         latlong.check_envmap_size(height, width)
         memory_gb = allowed(memory_gb)
         for name, value in (("spp", spp), ("max_depth", max_depth)):

@@ -289,7 +289,9 @@ WRITERS = {
     "edited.exr": lambda path: images.write_exr(path, PICTURE),
     "edited_layers.exr": lambda path: layered_exr.write(path, {"edited": PICTURE, "grey": PICTURE[..., 0]}),
     "influence.png": lambda path: preview.influence(path, PICTURE[..., 0], None),
-    "preview.png": lambda path: preview.preview(path, RESULT["renders"], RESULT["maps"]),
+    "preview.png": lambda path: atomic_files.write_atomically(
+        path, preview.sheet(RESULT["renders"], RESULT["maps"])
+    ),
     "history.csv": lambda path: manifest.write_history(path, ROWS),
     "metrics.json": lambda path: manifest.write_json(path, {"rows": ROWS}),
     "config.toml": lambda path: atomic_files.write_atomically(path, b"# a comment\n" * 100),

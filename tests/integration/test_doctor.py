@@ -98,7 +98,7 @@ def test_a_success_is_remembered_until_something_changes(monkeypatch, cache, tmp
     monkeypatch.setenv("DRJIT_LIBLLVM_PATH", "/elsewhere")
     doctor.ensure()
     assert len(calls) == 4
-    monkeypatch.setattr(doctor, "_version", lambda package: "99.0")
+    monkeypatch.setattr(doctor.machine, "version", lambda package: "99.0")
     doctor.ensure()
     assert len(calls) == 5
 

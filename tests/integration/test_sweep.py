@@ -1,5 +1,6 @@
 """Sweeps: jobs and their hashes, and real processes that are killed at bad moments."""
 
+import dataclasses
 import importlib.util
 import io
 import json
@@ -69,6 +70,7 @@ def stub(tmp_path, monkeypatch):
     """The stand-in's command and its notes; what the test started is ended."""
     monkeypatch.setattr(drive, "RETRY_SECONDS", 0.05)
     stub = Stub(tmp_path)
+    monkeypatch.setattr("envedit.sweep.read_jobs", lambda path: stub.of(read_jobs(path)))
     yield stub
     stub.free()
     for driver in stub.drivers:
@@ -86,7 +88,11 @@ class Stub:
         self.command = ("{python}", "-S", str(folder / "stub.py"), "{folder}", str(self.notes))
 
     def jobs(self, count):
-        return [job(f"job {seed}", f"seed = {seed}") for seed in range(count)]
+        return self.of(job(f"job {seed}", f"seed = {seed}") for seed in range(count))
+
+    def of(self, jobs):
+        """The same jobs, carried out by the stand-in."""
+        return [dataclasses.replace(one, command=self.command) for one in jobs]
 
     def written(self, count):
         """Jobs in a file."""
@@ -119,9 +125,12 @@ class Stub:
         text = (
             # A shell starts what runs in its background with Ctrl-C ignored, and that is inherited.
             "import signal; signal.signal(signal.SIGINT, signal.default_int_handler);"
-            "import sys; from envedit.sweep import drive, process; from envedit.cli.sweep import main;"
+            "import dataclasses, sys; from envedit import sweep; from envedit.cli.sweep import main;"
+            "from envedit.sweep import drive, process, read_jobs as read;"
+            f"stub = lambda one: dataclasses.replace(one, command={self.command!r});"
+            "sweep.read_jobs = lambda path: [*map(stub, read(path))];"
             f"drive.CONNECT_SECONDS, process.GRACE_SECONDS = {connect}, {LIMIT_SECONDS};"
-            f"sys.exit(main(sys.argv[1:], command={self.command!r}))"
+            "sys.exit(main(sys.argv[1:]))"
         )
         arguments = [str(self.written(count)), "--out", str(self.out), *options]
         started = subprocess.Popen(
@@ -136,7 +145,7 @@ class Stub:
 
     def run(self, count=None, jobs=None, **options):
         said = io.StringIO()
-        found = sweep(jobs or self.jobs(count), self.out, command=self.command, stream=said, **options)
+        found = sweep(self.of(jobs or self.jobs(count)), self.out, stream=said, **options)
         return [one.state for one in found], said.getvalue()
 
 
@@ -238,7 +247,7 @@ def test_a_job_that_is_killed_is_reported_and_done_by_the_next_call(stub):
 def test_a_failed_job_is_reported_by_its_last_words_and_does_not_stop_the_others(stub, capsys):
     stub.block("fail", 1)
     ask = [str(stub.written(3)), "--out", str(stub.out)]
-    assert main(ask, stub.command) == 1
+    assert main(ask) == 1
     said = capsys.readouterr()
     line = next(line for line in said.err.splitlines() if "job 1" in line)
     assert "exit code 5: the last line" in line and "1 failed" in line
@@ -248,11 +257,11 @@ def test_a_failed_job_is_reported_by_its_last_words_and_does_not_stop_the_others
     folder = stub.jobs(3)[1].folder(stub.out)
     assert json.loads((folder / "failed.json").read_text())["code"] == 5
     assert "first words" in (folder / "log.txt").read_text()
-    assert main([*ask, "--quiet"], stub.command) == 1  # it is tried again
+    assert main([*ask, "--quiet"]) == 1  # it is tried again
     said = capsys.readouterr()
     assert said.out == "" and "the last line" in said.err
     stub.free()
-    assert main([*ask, "--quiet"], stub.command) == 0
+    assert main([*ask, "--quiet"]) == 0
     assert capsys.readouterr() == ("", "")
     assert stub.counts("begin", 3) == [1, 3, 1]
 
@@ -335,7 +344,7 @@ def test_jobs_of_the_same_content_run_once(stub):
 
 def test_a_folder_that_cannot_be_written_to_is_an_error_on_one_line(stub, capsys):
     (stub.folder / "file").write_text("")
-    assert main([str(stub.written(1)), "--out", str(stub.folder / "file" / "x")], stub.command) == 3
+    assert main([str(stub.written(1)), "--out", str(stub.folder / "file" / "x")]) == 3
     assert len(capsys.readouterr().err.splitlines()) == 1
     one = stub.jobs(1)[0]
     stub.out.mkdir()
@@ -373,7 +382,7 @@ def test_drjit_takes_the_number_of_threads(stub):
     )
     stub.command = (*COMMAND[:2], COMMAND[2].replace(run, show), *COMMAND[3:])
     one = stub.jobs(1)[0]
-    error = run_job(one, stub.out, stub.command, threads=5).error
+    error = run_job(one, stub.out, threads=5).error
     folder = one.folder(stub.out)
     assert error == f"exit code 1: 5 ['{folder}/job.toml', '--out', '{folder}', '--resume']"
 
@@ -409,7 +418,7 @@ def test_results_of_another_version_are_not_used(stub, monkeypatch):
     monkeypatch.setattr("envedit.sweep.jobs.program", lambda: "another")
     new = stub.jobs(1)[0]
     assert new.key != old.key and job("x", "", version="1").key != job("x", "").key
-    outcome = run_job(new, stub.out, stub.command, 1)  # as on a worker that has the old one
+    outcome = run_job(new, stub.out, 1)  # as on a worker that has the old one
     assert outcome.state == "failed" and program() in outcome.error and "install the same" in outcome.error
     assert not new.folder(stub.out).exists() and stub.counts("begin", 1) == [1]
 
@@ -545,7 +554,7 @@ def test_a_real_run_is_made(tmp_path):
 @pytest.mark.skipif(DASK, reason="dask.distributed is there")
 def test_without_dask_the_option_says_what_to_install(stub, capsys):
     where = ["--out", str(stub.out), "--scheduler", "tcp://127.0.0.1:1"]
-    assert main([str(stub.written(2)), *where], stub.command) == 4
+    assert main([str(stub.written(2)), *where]) == 4
     assert "pip install '.[cluster]'" in capsys.readouterr().err
 
 

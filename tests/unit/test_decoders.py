@@ -290,7 +290,7 @@ def damaged_files(folder, rng):
         yield name, words
     (folder / "folder.exr").mkdir()
     os.mkfifo(folder / "pipe.exr")
-    yield from {"folder.exr": "is a folder", "pipe.exr": "not a regular", "gone.exr": "no such file"}.items()
+    yield from {"folder.exr": "is a folder", "pipe.exr": "no regular", "gone.exr": "no such file"}.items()
 
 
 def test_damaged_files_are_refused_quietly(tmp_path, rng, capfd):

@@ -57,14 +57,6 @@ def test_load_envmap(tmp_path, rng):
     np.testing.assert_allclose(images.load_envmap(path, repair=True)[0][5, 2, 0], 65504)
 
 
-@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.int32, np.float64])
-def test_codes_given_as_an_array_are_told(dtype):
-    found, info = images.load_envmap(np.full((4, 8, 3), 200, dtype))
-    assert (found == 200).all()
-    told = f"an array of {np.dtype(dtype)} is taken as linear radiance" in "".join(info["warnings"])
-    assert told is (dtype in (np.uint8, np.uint16))
-
-
 def test_load_envmap_refusals(tmp_path):
     def grey(height, width, value=1.0):
         return exr(tmp_path / "g.exr", **{c: np.full((height, width), value, np.float32) for c in "RGB"})

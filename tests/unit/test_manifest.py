@@ -64,13 +64,12 @@ def test_manifest_names_what_explains_a_run(tmp_path):
     (tmp_path / "abc.exr").write_bytes(b"abc")
     with open(tmp_path / "sparse", "wb") as file:
         file.truncate(60 * 10**9)
-    inputs = {"envmap": "abc.exr", "mask": None, "scene": "gone.xml", "folder": ".", "large": "sparse"}
-    inputs = {role: name and tmp_path / name for role, name in inputs.items()}
+    inputs = {"envmap": "abc.exr", "scene": "gone.xml", "folder": ".", "large": "sparse"}
+    inputs = {role: tmp_path / name for role, name in inputs.items()}
     found = manifest.manifest({"seed": 3, "preset": "draft"}, inputs, "llvm_ad_rgb")
     # FIPS 180-2, appendix B.1
     digest = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
     assert found["inputs"]["envmap"] == {"path": str(tmp_path / "abc.exr"), "bytes": 3, "sha256": digest}
-    assert "mask" not in found["inputs"]
     assert found["inputs"]["scene"]["sha256"] is None and "gone.xml" in found["inputs"]["scene"]["error"]
     assert found["inputs"]["folder"]["sha256"] is None and found["inputs"]["large"]["sha256"] is None
     assert "60000000000 bytes, expected at most 4294967296" in found["inputs"]["large"]["error"]

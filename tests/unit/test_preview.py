@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from envedit.core import latlong
+from envedit.core.atomic_files import write_atomically
 from envedit.core.color import luminance
 from envedit.core.resampling import fit
 from envedit.images import images
@@ -30,7 +31,7 @@ def test_shrinking_averages_areas_and_enlarging_repeats_texels(rng):
 def test_preview_places_tonemapped_renderings_above_their_maps(tmp_path):
     renders = {"initial": grey(0.25, 320, 320), "target": grey(0.5, 320, 320), "edited": grey(7.0, 320, 320)}
     maps = {"initial": grey(1e-30), "target": None, "edited": grey(0.125)}
-    preview.preview(tmp_path / "preview.png", renders, maps)
+    write_atomically(tmp_path / "preview.png", preview.sheet(renders, maps))
     png, gap = read_png(tmp_path / "preview.png"), preview.GAP
     assert png.shape == (gap + 320 + gap + 160 + gap, gap + 3 * (320 + gap), 3)
     centres = [gap + 160 + i * (320 + gap) for i in range(3)]
@@ -48,7 +49,7 @@ def test_pictures_that_would_be_white_or_black_are_exposed(factor, rng, tmp_path
     shown = preview.display(image, "gamma", stops).mean(axis=2)
     assert ((shown > 12) & (shown < 243)).mean() > 0.8 and (stops == 0) == (0.1 < factor < 2)
     assert preview.exposed(stops) == (f", {stops:+d} stops" if stops else "")
-    preview.preview(tmp_path / "p.png", {"edited": image}, {"edited": image})
+    write_atomically(tmp_path / "p.png", preview.sheet({"edited": image}, {"edited": image}))
     drawn = read_png(tmp_path / "p.png")
     assert 12 < np.median(drawn[drawn != preview.BACKGROUND]) < 243
     text = f"edited; renderings{preview.exposed(stops)} over maps{preview.exposed(stops)}"
@@ -58,14 +59,16 @@ def test_pictures_that_would_be_white_or_black_are_exposed(factor, rng, tmp_path
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 4096), (4096, 1), (3, 5), (64, 64), (100, 1500)])
 def test_preview_takes_any_size(tmp_path, shape):
-    preview.preview(tmp_path / "p.png", {"a": np.ones((*shape, 3), np.float32)}, {"a": grey(0.0, 1, 1)})
+    write_atomically(
+        tmp_path / "p.png", preview.sheet({"a": np.ones((*shape, 3), np.float32)}, {"a": grey(0.0, 1, 1)})
+    )
     height, width, _ = read_png(tmp_path / "p.png").shape
     assert 214 <= width <= 800 and height <= 4 * 800
 
 
 def test_preview_names_its_columns_whatever_their_text(tmp_path):
     names = ["x" * 500, "zażółć ☀ \n\0 \udcff", "", "edited"]
-    preview.preview(tmp_path / "p.png", {name: grey(0.5) for name in names}, {})
+    write_atomically(tmp_path / "p.png", preview.sheet({name: grey(0.5) for name in names}, {}))
     assert read_png(tmp_path / "p.png").ndim == 3
     assert "x" * 500 in described(tmp_path / "p.png")
 

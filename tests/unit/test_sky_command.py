@@ -27,17 +27,18 @@ EPHEMERIS = [
 
 @pytest.mark.parametrize(("latitude", "longitude", "time", "azimuth", "elevation"), EPHEMERIS)
 def test_the_sun_stands_where_the_ephemeris_has_it(latitude, longitude, time, azimuth, elevation):
-    sun = sun_position.sun_position(latitude, longitude, sun_position.moment(time))
-    assert sun.elevation == pytest.approx(elevation, abs=0.02)  # of it 0.01 are refraction at the horizon
-    off = np.radians(sun.azimuth - azimuth) * np.cos(np.radians(elevation))
+    sun_azimuth, sun_elevation = sun_position.sun_position(latitude, longitude, sun_position.moment(time))
+    assert sun_elevation == pytest.approx(elevation, abs=0.02)  # of it 0.01 are refraction at the horizon
+    off = np.radians(sun_azimuth - azimuth) * np.cos(np.radians(elevation))
     assert abs(np.degrees(off)) < 0.01
 
 
 def test_poles_and_dates_at_the_ends_are_finite():
     for latitude in (-90, 90):
         for year in sun_position.YEARS:
-            sun = sun_position.sun_position(latitude, 0, sun_position.moment(f"{year}-06-21T00:00Z"))
-            assert abs(abs(sun.elevation) - 23.45) < 0.1 and 0 <= sun.azimuth < 360
+            moment = sun_position.moment(f"{year}-06-21T00:00Z")
+            azimuth, elevation = sun_position.sun_position(latitude, 0, moment)
+            assert abs(abs(elevation) - 23.45) < 0.1 and 0 <= azimuth < 360
 
 
 def test_the_sun_of_the_map_is_at_that_azimuth_from_north_and_elevation(tmp_path, capsys):
@@ -76,7 +77,7 @@ PLACE = ["--place", "47", "8"]
     ([*PLACE, "--date", "1066-10-14T12:00Z"], "got year 1066, expected 1800 to 2200"),
     ([*PLACE, "--date", "2026-06-21T23:30Z"], "below the horizon there and then"),
     (["--place", "91", "8", "--date", "2026-06-21T12:00Z"], "--place: got 91 8"),
-    (["--elevation", "30", "--width", "7"], "width must be even"),
+    (["--elevation", "30", "--width", "7"], "width: got 7, expected an even integer"),
 ])  # fmt: skip
 def test_bad_options_are_one_line(options, says, tmp_path, capsys, here):
     assert sky.main(options) == 2

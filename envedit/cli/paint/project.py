@@ -6,12 +6,13 @@ import contextlib
 import hashlib
 import json
 from collections.abc import Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from envedit import config
 from envedit.cli import run
 from envedit.cli.paint.protocol import ORIENTATION, Document
+from envedit.config import presets
 from envedit.core import array_cache, atomic_files, file_locks
 from envedit.core.errors import ConfigError, InputError
 
@@ -47,11 +48,7 @@ class Project:
         settings = self.settings
         target = {"kind": "strokes", "strokes": document.strokes} if document.strokes else {"kind": "none"}
         kept = ("tonemap", "paint", "hold", "spp") if document.strokes else ("spp",)
-        given = {
-            f.name: {key: getattr(table, key) for key in sorted(table.given)}
-            for f in fields(settings)
-            if hasattr(table := getattr(settings, f.name), "given")
-        }
+        given = settings.given_tables
         given["target"] = {key: given["target"][key] for key in kept if key in given["target"]} | target
         given["scene"]["file"] = settings.scene.file
         if "parameters" in given["scene"]:
@@ -173,8 +170,8 @@ def _of_photo(settings, base):
     folder = Path(settings.output.dir)
     matched = folder / f"photograph-{key}" / MATCHED
     photo = replace(settings, output=_without(settings.output, dir=str(matched.parent), format="exr"))
-    given = settings.input
-    kept = {name: getattr(given, name) for name in ("width", "rows", "horizon") if name in given.given}
+    given = settings.input.given_values
+    kept = {name: given[name] for name in ("width", "rows", "horizon") if name in given}
     plain = _plain(replace(settings, lights=config.Lights()), folder)
     plain = replace(plain, input=config.Input(envmap=str(matched), **kept))
     return Project(plain, folder, base, Document(), photo=None if matched.exists() else photo)
@@ -182,7 +179,7 @@ def _of_photo(settings, base):
 
 def _path(envmap):
     """Return a word as it is, and a path from the working folder as an absolute one."""
-    return envmap if envmap in ("auto", "scene", "sunsky") else str(Path(envmap).absolute())
+    return envmap if envmap in presets.MAP_WORDS else str(Path(envmap).absolute())
 
 
 def _plain(settings, folder):
@@ -199,7 +196,7 @@ def _plain(settings, folder):
 
 def _without(table, *names, **more):
     """Return a table with some keys as if they had not been given, and others as given."""
-    kept = {key: getattr(table, key) for key in table.given if key not in names}
+    kept = {key: value for key, value in table.given_values.items() if key not in names}
     return type(table)(**kept | more)
 
 

@@ -125,11 +125,11 @@ class Hub(Tell):
 class Server:
     """Page, worker and what lies between them.
 
-    ``opened`` is what is painted on; None: the start page. With port 0 any that is free is taken. ``token``
-    is part of every address; None: a random one. OSError if the port is in use.
+    ``opened`` is what is painted on; None: the start page. With port 0 any that is free is taken. OSError if
+    the port is in use. A random ``token`` is part of every address.
     """
 
-    def __init__(self, opened: project.Project | None = None, port: int = 0, token: str | None = None):
+    def __init__(self, opened: project.Project | None = None, port: int = 0):
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
         self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
@@ -138,7 +138,8 @@ class Server:
         except OSError:
             self.socket.close()
             raise
-        self.port, self.token = self.socket.getsockname()[1], token or secrets.token_urlsafe(16)
+        self.port = self.socket.getsockname()[1]
+        self.token = secrets.token_urlsafe(16)
         self.hub = Hub()
         self.opened, self.worker = opened, Worker(self.hub, opened)
         self.thumbnails = thumbnails.Thumbnails(self.hub.say)

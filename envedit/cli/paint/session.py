@@ -197,11 +197,11 @@ class Session:
             else:
                 self._paint()
                 self.reach = reach
-            self._show("transport")
+            self._show()
         except Exception:
             self.phase = "done"
             self._aim(before)
-            self._show("transport")
+            self._show()
             self._tell_document("")
             raise
         self._tell_document(edit.client)
@@ -339,7 +339,7 @@ class Session:
         if history:
             self.status["residual"] = history[-1]["residual"]
         self.status["ms"] = round(1000 * (time.perf_counter() - began), 1)
-        self._show("transport")
+        self._show()
         self.tell_state()
         if self.converged:
             self._tell_lights()
@@ -352,7 +352,7 @@ class Session:
         if self.solution.run is not before:
             self._rendered = None
         self._tell_explanations()
-        self._show("transport")
+        self._show()
         self._tell_lights()
         self.tell_state()
 
@@ -383,7 +383,7 @@ class Session:
         self._rendered, self.resting, self.advised = None, False, False
         self.status = {"iterations": 0, **{name: self.status[name] for name in ("steps", "number", "client")}}
         self._tell_explanations()
-        self._show("transport")
+        self._show()
         self._tell_lights()
         self.tell_state()
 
@@ -475,7 +475,7 @@ class Session:
         output = replace(settings.output, exposure=document.exposure, temperature=document.temperature)
         return adjustments.adjust(edited, settings.lights, output, self.given.scale)[0]
 
-    def _show(self, source):
+    def _show(self):
         edited = self._edited()
         shown = self._adjusted(edited)
         rendering = self._preview[1] if self._dragged else self.solution.point.rendering
@@ -484,13 +484,13 @@ class Session:
             rendering = by.apply(tensor(shown)).numpy()
         if rendering is not self._shown:  # a stroke that is being drawn has changed nothing yet
             self._shown = rendering
-            self.tell.frame("render", source, rendering, self.scene.rows)
-            self.tell.frame("map", source, shown)
+            self.tell.frame("render", "transport", rendering, self.scene.rows)
+            self.tell.frame("map", "transport", shown)
         if not self._dragged:
             solution = self.solution
             both, white = (solution.target, solution.point.rendering), solution.problem.likelihood.white
             target, reached = (display_curve.values(one, white) for one in both)
-            self.tell.frame("difference", source, target - reached, self.scene.rows)
+            self.tell.frame("difference", "transport", target - reached, self.scene.rows)
 
     def sky(self) -> None:
         """Show the map large, as it is edited and as it was given, at the resolution of its file."""
@@ -519,7 +519,7 @@ class Session:
             self.tell.frame("photograph", "transport", self.photograph)
         self._tell_unreachable()
         self._tell_explanations()
-        self._show("transport")
+        self._show()
         self._rendered = None
         self._tell_lights()
         self.tell_state()

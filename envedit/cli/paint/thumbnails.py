@@ -72,7 +72,7 @@ class Thumbnails:
                 process.kill()
 
     def _tell(self, files):
-        from envedit.scene.scene_files import CODE
+        from envedit.scene.scene_files import CODE, request
 
         with self._lock:
             if self._stopped or not files:
@@ -86,9 +86,8 @@ class Thumbnails:
             )
             self._running.append(process)
         with process:
-            paths = [os.fspath(folder) for folder in sys.path]
             try:
-                process.stdin.write(json.dumps([paths, __name__, [files]]).encode())
+                process.stdin.write(request(__name__, [files]))
                 process.stdin.close()
             except BrokenPipeError:  # it was stopped
                 return
@@ -102,13 +101,9 @@ class Thumbnails:
 
 def main(files: Sequence[tuple[str, bool]]) -> None:
     """Write a line of JSON for each file, the smallest files first."""
-    import mitsuba as mi
+    from envedit.scene.scene_files import address_space, begin, limit
 
-    from envedit.scene.scene_files import address_space, limit
-
-    mi.set_variant("scalar_rgb" if "scalar_rgb" in mi.variants() else mi.variants()[0])
-    answers = os.fdopen(os.dup(1), "w")
-    os.dup2(2, 1)  # libraries print about odd files
+    say = begin()
     if hasattr(os, "nice"):
         os.nice(19)
     limit("RLIMIT_AS", address_space() + MEMORY)
@@ -117,7 +112,7 @@ def main(files: Sequence[tuple[str, bool]]) -> None:
         picture = None
         with contextlib.suppress(EnveditError, MemoryError):
             picture = base64.b64encode(thumbnail(file, panorama)).decode()
-        print(json.dumps({"file": file, "picture": picture}), file=answers, flush=True)
+        say({"file": file, "picture": picture})
 
 
 def thumbnail(file: str, panorama: bool) -> bytes:

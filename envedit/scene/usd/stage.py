@@ -6,14 +6,12 @@ any memory holds. This process has bounds on time, memory and the size of files,
 
 from __future__ import annotations
 
-import json
 import os
 import xml.etree.ElementTree as ET
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import mitsuba as mi
 import numpy as np
 from pxr import Ar, Tf, Usd, UsdGeom, UsdShade
 
@@ -58,14 +56,11 @@ def main(request: dict, seconds: int) -> None:
     ``request`` has ``file``, ``xml`` (the file to write), ``camera`` (as of :func:`.cameras.choose`) and
     ``time`` (a time code, or None for the first); ``seconds`` bounds the time of the processor.
     """
-    answers = os.fdopen(os.dup(1), "w")
-    os.dup2(2, 1)
+    say = scene_files.begin()
     scene_files.limit("RLIMIT_CPU", seconds)
     scene_files.limit("RLIMIT_AS", scene_files.address_space() + MEMORY)
     scene_files.limit("RLIMIT_FSIZE", FILE_BYTES)
-    mi.set_variant("scalar_rgb" if "scalar_rgb" in mi.variants() else mi.variants()[0])
-    mi.set_log_level(mi.LogLevel.Error)
-    print(json.dumps("begun"), file=answers, flush=True)
+    say("begun")
     try:
         answer = convert(**request)
     except EnveditError as error:
@@ -74,7 +69,7 @@ def main(request: dict, seconds: int) -> None:
         answer = {"error": f"{request['file']}: declares more than can be read", "usage": False}
     except Exception as error:  # a damaged file has many
         answer = {"error": f"{request['file']}: cannot be read ({type(error).__name__})", "usage": False}
-    print(json.dumps(answer), file=answers, flush=True)
+    say(answer)
 
 
 def convert(file: str, xml: str, camera: str = "", time: float | None = None) -> dict[str, Any]:

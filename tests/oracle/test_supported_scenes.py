@@ -11,6 +11,7 @@ from envedit import config, inputs
 from envedit.core import latlong
 from envedit.core.errors import ConfigError, InputError, NumericalError
 from envedit.images import images
+from envedit.scene import scene
 from envedit.transport.light_transport import LightTransport
 from tests.oracles import ROOT, users_scenes
 from tests.oracles.builders import BALL, SENSOR, sky, write_scene
@@ -213,7 +214,7 @@ def test_the_texels_that_a_light_was_given_are_the_map(rng):
         "ball": {"type": "sphere"},
         "light": {"type": "envmap", "bitmap": mi.Bitmap(texels), "scale": 2.0},
     }
-    found = inputs.read_map(config.Input(width=16), inputs.scenes.load(given), 16)
+    found = inputs.read_map(config.Input(width=16), scene.load(given), 16)
     assert found.stored.tobytes() == texels.tobytes() and found.scale == 2
 
 
@@ -230,7 +231,7 @@ def test_a_scene_without_an_environment_is_lit_by_a_map_beside_its_lamps(tmp_pat
     assert inputs.share(lit, radiance, 1) == pytest.approx(1 - alone.mean() / both.mean(), abs=0.03)
     assert any("the map lights the scene beside its own lamps" in note for note in lit.notes)
     again = tmp_path / "again.xml"
-    again.write_text(inputs.scenes.relit(tmp_path / "test.xml", "own.exr"))
+    again.write_text(scene.relit(tmp_path / "test.xml", "own.exr"))
     close(plain(again)[..., :3], both)
 
 
@@ -269,7 +270,7 @@ def test_the_scale_of_the_scene_can_be_dropped(tmp_path, rng):
     np.testing.assert_allclose(other, 800 * radiance, rtol=1e-6)
     assert lit.own.scale == 1 and any("scale 1 (scene.scale) takes the place of" in note for note in notes)
     again = tmp_path / "again.xml"
-    again.write_text(inputs.scenes.relit(tmp_path / "test.xml", "own.exr", scale=1))
+    again.write_text(scene.relit(tmp_path / "test.xml", "own.exr", scale=1))
     close(lit.render(radiance, SPP, 3), plain(again)[..., :3])
 
 
@@ -295,7 +296,7 @@ def test_a_cropped_film_is_enlarged_with_its_crop(tmp_path):
 
 def test_a_sensor_without_a_film_has_mitsuba_s(tmp_path):
     path = write_scene(tmp_path, PATH, NO_FILM, BALL, CONSTANT)
-    lit = inputs.scenes.load(path)
+    lit = scene.load(path)
     assert (lit.width, lit.height) == tuple(mi.load_file(str(path)).sensors()[0].film().size()) == (768, 576)
 
 

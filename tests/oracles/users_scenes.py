@@ -18,6 +18,7 @@ import numpy as np
 from envedit import config, inputs
 from envedit.core.errors import EnveditError
 from envedit.images import images
+from envedit.scene import scene
 from tests.oracles.builders import BALL, SENSOR, sky, write_scene
 
 PATH = '<integrator type="path"/>'
@@ -145,7 +146,7 @@ def write(folder: Path, parts, name="scene.xml") -> Path:
 def loaded(path: Path, width=0):
     """Load a file as a run does: scene, radiance of its map, and what the run says."""
     settings = config.from_dict({"input": {"width": 16}, "scene": {"file": str(path)}}, path.parent)
-    lit = inputs.scenes.load(settings.scene.file, width)
+    lit = scene.load(settings.scene.file, width)
     input_map = inputs.read_map(settings.input, lit, settings.input.width)
     return lit, input_map.radiance, inputs.notes(settings.input, lit, input_map)
 

@@ -49,7 +49,7 @@ def test_entries_and_sizes(home, capsys):
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text("mine")
     said = lines(capsys, "--empty")
-    counts = "2 entries", "1 entry", "0 entries", "1 entry"
+    counts = "2 entries", "1 entry", "0 entries", "1 entry", "0 entries"
     assert [line.rsplit(": ", 1)[1] for line in said] == [f"{count}, 0.0 MB deleted" for count in counts]
     assert not any(file.exists() for file in files)
     assert all(file.read_text() == "mine" for file in foreign)

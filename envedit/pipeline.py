@@ -15,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from envedit import config, inputs, renderers
-from envedit.core.color import luminance
+from envedit.core import color
 from envedit.core.errors import NumericalError, unwrapped
 from envedit.core.radiance import BRIGHTEST
 from envedit.core.rows import Rows
@@ -48,6 +48,10 @@ OUTLIER_DEVIATIONS = 3.0
 """Standard deviations beyond which a pixel of a photograph shows what no light of the map explains."""
 LEAST_GAIN = 0.05
 """Share of the residual below which an edit has achieved nothing, or made nothing worse: 0.45 dB."""
+
+MOST_ELSEWHERE = 30.0
+"""Change of what was not painted, over that of paint, from which on there is a warning. Of 91 edits of
+``experiments painted_edits.artists`` half have at most 4.3, 95 % at most 20, one more than 30."""
 
 
 @unwrapped()
@@ -279,7 +283,7 @@ class _Edit:
         if self.scene.own.added or not self.rows.all or self.map.kept is not None:
             return
         before, after = (
-            luminance(map_lights.irradiance(sky, np.array(list(map_lights.AXES.values()))))
+            color.luminance(map_lights.irradiance(sky, np.array(list(map_lights.AXES.values()))))
             for sky in (self.original, self.solved_map)
         )
         if before.min() > 0 and after.min() > 0:
@@ -481,6 +485,16 @@ class _Edit:
             measures["painted"] = metrics.painted(edited, target, initial, coverage, tonemap, seen, noise)
         return measures
 
+    def _changed_elsewhere(self):
+        """Return the change of what was not painted over that which is painted; 0 where that is noise."""
+        target, painted = self.target, self.metrics["painted"]
+        if painted["towards"] is None or painted["elsewhere"] is None:
+            return 0.0
+        name = self.settings.output.tonemap
+        before, after = (color.tonemap(picture, name) for picture in (target.initial, target.picture))
+        requested = float((target.coverage * np.abs(after - before)).mean())
+        return painted["elsewhere"] * float(1 - target.coverage.mean()) / max(requested, 1e-30)
+
     def warn_of_quality(self):
         """Warn of an edit that has made things worse, or nothing better; set ``worse`` of the metrics."""
         measures, state = self.metrics, self.state
@@ -504,6 +518,14 @@ class _Edit:
             self.warnings.append(
                 f"the result is farther from the target than the input: {how}; the edited map is kept "
                 f"anyway: look at it before you use it{rate}"
+            )
+
+        # ---- What was not painted
+        if measures["painted"] and (times := self._changed_elsewhere()) > MOST_ELSEWHERE:
+            self.warnings.append(
+                f"what was not painted has changed {times:.0f} times as much as the paint requires, all pixels "
+                'together: [target] rest = "keep" or a stroke of type "hold" keeps it, another explanation '
+                "may change less"
             )
 
         # ---- The map

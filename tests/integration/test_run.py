@@ -256,10 +256,11 @@ def test_a_result_worse_than_the_input_is_a_warning(tmp_path, rng, monkeypatch, 
 @pytest.mark.slow
 def test_paint_that_a_result_is_farther_from_is_a_warning(tmp_path, rng, capsys):
     """Brighter is asked for; what is written is darker, by the exposure of the output."""
-    stroke = {"type": "light", "ellipse": [0.45, 0.4, 0.15, 0.15], "amount": 2.0}
+    stroke = {"type": "light", "ellipse": [0.45, 0.4, 0.06, 0.06], "amount": 2.0}
     path = world(tmp_path, rng, target={"kind": "strokes", "strokes": [stroke]}, output={"exposure": -3.0})
     assert call(path, "--quiet", "--out", tmp_path / "out") == 0
     said = capsys.readouterr().err
+    assert "what was not painted has changed " in said
     assert "the result is farther from the target than the input: -" in said
     assert measured(tmp_path / "out")["worse"] is True
 

@@ -524,8 +524,8 @@ class _Edit:
         if measures["painted"] and (times := self._changed_elsewhere()) > MOST_ELSEWHERE:
             self.warnings.append(
                 f"what was not painted has changed {times:.0f} times as much as the paint requires, all "
-                'pixels together: [target] rest = "keep" or a stroke of type "hold" keeps it, another explanation '
-                "may change less"
+                'pixels together: [target] rest = "keep" or a stroke of type "hold" keeps it, another '
+                "explanation may change less"
             )
 
         # ---- The map

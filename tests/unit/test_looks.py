@@ -154,6 +154,7 @@ def test_the_command_writes_maps_of_the_files_own_size_and_format(tmp_path, here
     assert images.read("evening_applied/a.exr")[0].shape == (32, 64, 3)
     assert cli.main(["apply", "evening.toml", "a.exr"]) == 2
     assert "evening_applied/a.exr: exists already: give another folder" in capsys.readouterr().err
+    assert cli.main(["apply", "evening.toml", "a.exr", "--out", "b.hdr"]) == 3  # a file, where a folder goes
     assert cli.main(["apply", "evening.toml", "a.exr", "--frames", "2", "--out", "frames"]) == 0
     frames = [images.read(f"frames/a_{i:04d}.exr")[0] for i in (1, 2)]
     assert np.array_equal(frames[0], images.read("a.exr")[0]) and not np.allclose(*frames)

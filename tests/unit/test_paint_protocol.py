@@ -147,6 +147,13 @@ def test_two_servers_do_not_paint_in_one_folder(tmp_path, capsys):
     assert list(opened.folder.iterdir()) == []
 
 
+@pytest.mark.parametrize("option", [["--camera", "left"], ["--preset", "draft"]])
+def test_an_option_of_a_scene_needs_a_scene(option, capsys):
+    with pytest.raises(SystemExit, match="2"):
+        paint.main([*option, "--no-browser"])
+    assert "name one" in capsys.readouterr().err
+
+
 def test_what_paint_cannot_solve_is_refused(tmp_path):
     file = tmp_path / "edit.toml"
     file.write_text('preset = "paper"\n')

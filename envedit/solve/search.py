@@ -104,9 +104,8 @@ def search(
     while better:
         best = better
         moves = _moves(problem, best, sigma)
-        promising = [move for move in moves if move.gain > 0]
-        if not promising and len(compared) == 1 and _unfollowed(problem, best, sigma):
-            promising = _of_best_kinds(moves)  # for other explanations to be shown
+        kinds = _best_kinds(moves) if len(compared) == 1 and _unfollowed(problem, best, sigma) else ()
+        promising = [move for move in moves if move.gain > 0 or (move.light, move.what) in kinds]
         neighbours = _neighbours(problem, best, promising, sigma, after_step, steps, cleared)
         compared += neighbours
         better = _likelier(best, neighbours)
@@ -232,11 +231,10 @@ def _moves(problem, best, sigma):
     ]
 
 
-def _of_best_kinds(moves):
-    """List the moves of as many kinds as are shown, those that promise most."""
+def _best_kinds(moves):
+    """List the kinds of moves, light and what, that promise most: as many as are shown."""
     ranked = sorted(moves, key=lambda move: -move.gain)
-    kinds = list(dict.fromkeys((move.light, move.what) for move in ranked))[:MOST_OTHERS]
-    return [move for move in moves if (move.light, move.what) in kinds]
+    return list(dict.fromkeys((move.light, move.what) for move in ranked))[:MOST_OTHERS]
 
 
 def _beside_the_sky(problem, best, sigma):

@@ -492,8 +492,9 @@ class _Edit:
             return 0.0
         name = self.settings.output.tonemap
         before, after = (color.tonemap(picture, name) for picture in (target.initial, target.picture))
-        requested = float((target.coverage * np.abs(after - before)).mean())
-        return painted["elsewhere"] * float(1 - target.coverage.mean()) / max(requested, 1e-30)
+        seen = True if self.scene.alpha is None else self.scene.alpha[..., None] > 0
+        requested = float((target.coverage * np.abs(after - before) * seen).mean())
+        return painted["elsewhere"] * float(((1 - target.coverage) * seen).mean()) / max(requested, 1e-30)
 
     def warn_of_quality(self):
         """Warn of an edit that has made things worse, or nothing better; set ``worse`` of the metrics."""

@@ -141,8 +141,8 @@ class LayersSolver:
                     params,
                     run,
                     sparing,
-                    iterations=settings.iterations,
-                    after_step=keep.after_step,
+                    settings.iterations,
+                    keep.after_step,
                 )
                 following = self._following(solution, interrupt)
                 if following is None:
@@ -152,12 +152,12 @@ class LayersSolver:
         self.note = "; ".join(self._notes(solution))
         return solution.params, adam_loop.State(step=len(solution.history), history=solution.history)
 
-    def _steps(self, problem, params, run, sparing, **steps):
+    def _steps(self, problem, params, run, sparing, iterations=2 * gauss_newton.MOST_STEPS, after_step=None):
         """Make steps; what those towards a photograph find of its camera is taken off the target."""
         photographed = self.edit.target.photo is not None
         judge = self._display_error if sparing and not photographed else None
         solution = gauss_newton.solve(
-            problem, params, self.edit.sigma, run=run, sparing=sparing, judge=judge, **steps
+            problem, params, self.edit.sigma, iterations, after_step, run, sparing, judge
         )
         if photographed:
             self._take_off_camera(solution)

@@ -300,9 +300,8 @@ def _under_the_original(problem, best, sigma):
         away = problem.direction(state, k)
         cost = _cost_of_choice(problem) if own and not start["turn"][k].any() else 0.0
         for there in painted_places.best(problem, dark, k, sigma, away):
-            placed = _placed(lights, k, there)
-            moved = with_light(state, k, **placed)
-            centre = with_light(start, k, **({"turn": placed["turn"]} if own else placed))
+            moved = _put(lights, state, k, there)
+            centre = with_light(start, k, turn=moved["turn"][k]) if own else _put(lights, start, k, there)
             yield _Move(k, MOVED, moved, centre, gain=now - there.unlikeliness - cost)
         # ---- softer: a light of few texels cannot grow, as its texels would part; a lobe can
         if own and spare:
@@ -320,15 +319,16 @@ def _under_the_original(problem, best, sigma):
     # ---- one more, as large as it must be
     for k in spare[:1]:
         for there in painted_places.best(problem, state, k, sigma):
-            placed = _placed(lights, k, there)
-            more, centre = (with_light(one, k, **placed) for one in (state, start))
+            more, centre = (_put(lights, one, k, there) for one in (state, start))
             yield _Move(k, ADDED, more, centre, gain=now - there.unlikeliness - ADDED_LIGHT_COST)
 
 
-def _placed(lights, k, there):
-    """Return the unknowns that put light ``k`` in a place; an added one has a size there."""
-    placed = {"turn": rotation_vector(lights.centres[k], there.direction), "flux": there.log_flux}
-    return placed if k < lights.own else placed | {"size": lights.log_size(there.degrees)}
+def _put(lights, state, k, there):
+    """Return a state with light ``k`` in a place; an added one has a size there."""
+    turn = rotation_vector(lights.centres[k], there.direction)
+    if k < lights.own:
+        return with_light(state, k, turn=turn, flux=there.log_flux)
+    return with_light(state, k, turn=turn, flux=there.log_flux, size=lights.log_size(there.degrees))
 
 
 def _unlikeliness(problem, state, sigma):

@@ -15,6 +15,7 @@ from envedit.targets import initial_rendering
 from experiments import puresky
 from experiments.harness import Case, Done, Experiment, calling
 from experiments.natural.skies import KEPT
+from experiments.painted_edits import one_light
 from experiments.painted_edits.experiment import PAINT, STATISTICS, explanation
 from experiments.painted_edits.painters import PAINTERS, SHADOWS, View
 from experiments.summary import Summary
@@ -31,6 +32,8 @@ MATPREVIEW_SCALE = 0.5
 """Factor of the map in place of the scene's own, 3, by which its picture is white under most skies."""
 MATPREVIEW_TURN = 60.0
 """Degrees by which its maps are turned: their suns are behind its camera, and cast no shadow that is seen."""
+EXPLAINED = 0.75
+"""Share of the paint from which on lights explain it."""
 SUN = 0.25
 """Share of the brightest light's flux from which on another light is a sun as well."""
 EDIT = "edit"
@@ -88,7 +91,8 @@ def carry_out(settings, folder, edit: str) -> dict:
     scene = inputs.load_scene(settings.scene)
     envmap, _ = inputs.load_map(settings.input, scene)
     view = View(scene, envmap)
-    paint = PAINTERS[edit](view, initial_rendering.initial(scene, envmap, settings))
+    initial = initial_rendering.initial(scene, envmap, settings)
+    paint = PAINTERS[edit](view, initial)
     if paint is None:
         return {}
 
@@ -107,6 +111,7 @@ def carry_out(settings, folder, edit: str) -> dict:
         **result.metrics,
         **result.metrics["painted"],
         **result.metrics["natural"],
+        "one_light": one_light.share(settings, view, initial, paint),
         "explanation": explanation(result.notes),
         "sun_off": off,
         "suns": sum(f >= SUN * max(flux) for f in flux),
@@ -115,8 +120,11 @@ def carry_out(settings, folder, edit: str) -> dict:
 
 def measure(done: Done) -> list[dict]:
     """Return the row of a case; none where there was nothing to paint on."""
+    if not done.metrics:
+        return []
     kept = " (kept out)" if done.case.about["map"] in KEPT else ""
-    return [{"kept": kept, **done.metrics}] if done.metrics else []
+    explained = done.metrics["one_light"] >= EXPLAINED
+    return [{"kept": kept, "of_explained": done.metrics["towards"] if explained else None, **done.metrics}]
 
 
 def panels(done: Done):
@@ -138,9 +146,20 @@ EXPERIMENT = Experiment(
         "map": "{map}{kept}",
         "sun off, degrees": "{sun_off:.1f}",
         "suns": "{suns}",
+        "lights explain": "{one_light:.0%}",
         **PAINT,
     },
-    summary=Summary({"edit": "{edit}"}, STATISTICS | {"sun off, degrees, at most": "{sun_off.max:.1f}"}),
+    summary=Summary(
+        {"edit": "{edit}"},
+        STATISTICS
+        | {
+            "lights explain": "{one_light.mean:.0%}",
+            "at least 75 % of them towards the paint, of those that lights explain so far": (
+                "{of_explained.above[0.75]} of {of_explained.count}"
+            ),
+            "sun off, degrees, at most": "{sun_off.max:.1f}",
+        },
+    ),
     panels=panels,
     sheet=lambda case: f"artists_{case.about['scene']}.jpg",
     options=options,

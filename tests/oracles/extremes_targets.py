@@ -202,7 +202,7 @@ TARGETS = {
         _equal,
         refused(InputError, "target: nothing of the picture is painted"),
     ),
-    "equal to it, in the loop": (
+    "equal to the initial rendering, in the loop": (
         _equal_in_the_loop,
         done("Loss and gradient are 0: no bit of the map changes."),
     ),

@@ -224,17 +224,14 @@ What happens with scenes of each kind, and with each plugin of Mitsuba 3.9. Test
   scenes are lit by an analytic sky.
 - **Orientation and scale.** The `to_world` and `scale` of an `envmap` apply to any map; `[scene] scale`
   replaces the scale, which is not in `edited.exr`. The zenith of `sunsky` is +z; for `constant`, and without
-  an emitter, it is the axis that is up for the first sensor, or `[scene] up`.
-- **The picture** is Mitsuba's, to its noise. `[scene] width` is its size, or that of the film's
-  crop.
+  an emitter, it is the axis that is up for the first sensor, or `[scene] up`. A `to_world` that mirrors or
+  shears is refused.
 - **Several views.** `[scene] sensors = "all"`, or a list by `id` or by index from 0, makes every one a
   picture; without it the first is used. They need the same width, and not `renderer.kind = "path"`.
 - **Variants.** `llvm_ad_rgb` and, on an NVIDIA GPU, `cuda_ad_rgb`; `metal_ad_rgb` was not tried. Spectra are
   converted to RGB. Spectral and polarised rendering are not supported.
-- **Your scenes.** `python -m experiments scenes run FOLDER` loads, renders and edits every Mitsuba scene of a
-  folder ([results](../experiments/scenes/README.md)).
-- **Refused**, with all reasons at once: a `to_world` of the map that mirrors or shears, and what the tables
-  say.
+
+[This experiment](../experiments/scenes/README.md) loads, renders and edits every Mitsuba scene of a folder.
 """
 
 
@@ -249,12 +246,17 @@ def happened(kind: Kind) -> str:
 
 def page() -> str:
     lines = [HEAD, "## Kinds of scenes", "", "| scene | what happens |", "|---|---|"]
-    lines += [f"| {kind.name} | {kind.happens.replace('<', '`<').replace('>', '>`')} |" for kind in KINDS]
+    alike = {}
+    for kind in KINDS:
+        alike.setdefault(kind.happens.replace("<", "`<").replace(">", ">`"), []).append(kind.name)
+    lines += [f"| {'; '.join(names)} | {happens} |" for happens, names in alike.items()]
     lines += ["", "## Plugins", "", "| kind | plugin | what happens |", "|---|---|---|"]
     for kind, plugins in PLUGINS.items():
         by_what = {}
         for name, what in plugins.items():
             by_what.setdefault(what, []).append(f"`{name}`")
+        if len(by_what) == 1:
+            by_what[what] = ["all of Mitsuba's"]
         lines += [f"| {kind} | {', '.join(names)} | {what} |" for what, names in by_what.items()]
     return "\n".join(lines) + "\n"
 

@@ -12,7 +12,7 @@ copyright = f"2026, {author}"
 version = release = envedit.__version__
 
 root_doc = "docs/index"
-include_patterns = ["docs/**", "experiments/*/README.md", "CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md"]
+include_patterns = ["docs/**", "experiments/*/*.md", "CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md"]
 exclude_patterns = ["docs/_redirect", ".*", "envedit", "tests", "scenes", "runs", "build", "dist"]
 
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]

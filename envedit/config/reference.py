@@ -86,9 +86,7 @@ def _lights() -> str:
         checks = [keys[key] for keys in (light_schema.OWN, light_schema.ADDED) if key in keys]
         rows.append([f"`{key}`", " / ".join(dict.fromkeys(map(_values, checks))), about])
     default = f"Radius of an added light where none is given: {light_schema.SIZE:g} degrees."
-    about = (
-        "A light of the map (with `light`), or one that is added; see [by hand](painting_in_the_browser.md)."
-    )
+    about = "A light of the map (with `light`), or one that is added; see [by hand](painting.md#move-lights)."
     return f"### [[input.lights]]\n\n{about} {default}\n\n{_table(['key', 'values', 'meaning'], rows)}"
 
 

@@ -251,13 +251,18 @@ def page() -> str:
         alike.setdefault(kind.happens.replace("<", "`<").replace(">", ">`"), []).append(kind.name)
     lines += [f"| {'; '.join(names)} | {happens} |" for happens, names in alike.items()]
     lines += ["", "## Plugins", "", "| kind | plugin | what happens |", "|---|---|---|"]
+    rows = []
+    whole_kinds = {}
     for kind, plugins in PLUGINS.items():
         by_what = {}
         for name, what in plugins.items():
             by_what.setdefault(what, []).append(f"`{name}`")
         if len(by_what) == 1:
-            by_what[what] = ["all of Mitsuba's"]
-        lines += [f"| {kind} | {', '.join(names)} | {what} |" for what, names in by_what.items()]
+            whole_kinds.setdefault(next(iter(by_what)), []).append(kind)
+        else:
+            rows += [f"| {kind} | {', '.join(names)} | {what} |" for what, names in by_what.items()]
+    rows += [f"| {', '.join(kinds)} | all of Mitsuba's | {what} |" for what, kinds in whole_kinds.items()]
+    lines += rows
     return "\n".join(lines) + "\n"
 
 

@@ -6,13 +6,13 @@ sine layers, a linear layer and a sigmoid::
     h_0 = sin(omega (W_0 x + b_0)),   h_i = sin(omega (W_i h_{i-1} + b_i)),   y = sigmoid(W h_depth + b)
 
 Parameters are a flat dict of tensors, ``"0.weight"`` (out, in) and ``"0.bias"`` (out,) upwards. Activations
-are (N, width), a point a row: Dr.Jit multiplies a tall matrix by a small one about twice as fast as a small
-one by a wide one, whose rows lie far apart in memory (``docs/engine.md``).
+are (N, width), a point a row: Dr.Jit multiplies a tall matrix by a small one faster than a small one by a
+wide one, whose rows lie far apart in memory (``docs/decisions/network_layout.md``).
 
 The reverse pass is written by hand. It keeps sine and cosine of each layer (``dr.sincos`` gives both for the
 price of one), and needs two matrix products a layer beside the forward one: that is the least possible. A
 bias gradient is a sum over points, of which every lane takes a stretch; a product with ones takes longer
-(``docs/engine.md``).
+(``docs/decisions/network_layout.md``).
 """
 
 from __future__ import annotations

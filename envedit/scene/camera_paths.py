@@ -58,10 +58,6 @@ class Escape:
     active: mi.Bool
 
 
-class NoPlaceError(ValueError):
-    """No light makes what is asked for at a place of a picture; the text says why."""
-
-
 def lattice(index: mi.UInt32, scramble: mi.UInt32) -> mi.Point2f:
     """Return point ``index`` of the R2 sequence, shifted by a hash of ``scramble``; in [0, 1)^2."""
     shift = mi.sample_tea_32(scramble, mi.UInt32(0x9E3779B9))
@@ -128,13 +124,6 @@ def trace(
         )
         active &= dr.max(dr.abs(throughput)) > 0
         pdf = dr.select(mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta), dr.inf, bs.pdf)
-
-
-def rays_through(scene: mi.Scene, view: int, places: np.ndarray) -> mi.Ray3f:
-    """Return the camera's rays through places (n, 2) of a view, as shares of its width and height."""
-    sensor = scene.sensors()[view]
-    place = mi.Point2f(*(flat(mi.Float, np.float32(share)) for share in places.T))
-    return mi.Ray3f(sensor.sample_ray(mi.Float(sensor.shutter_open()), 0.5, place, mi.Point2f(0.5))[0])
 
 
 @dr.syntax

@@ -1,12 +1,12 @@
-"""A light that is put where ``scene/highlight`` says makes its highlight at the place of the picture."""
+"""A light that is put where ``scene/placement`` says makes its highlight at the place of the picture."""
 
 import numpy as np
 import pytest
 
 from envedit.representations.layers import placed_lights
 from envedit.representations.layers.placed_lights import angles
-from envedit.scene import highlight, scene
-from envedit.scene.camera_paths import NoPlaceError
+from envedit.scene import placement, scene
+from envedit.scene.placement import NoPlaceError
 from tests.oracles.builders import AHEAD, BALL, HALF, LIGHT, ORIGIN, RIGHT, SENSOR, UP, write_scene
 from tests.oracles.tiers import slow_but
 from tests.unit.test_shadow import FLOOR
@@ -38,14 +38,14 @@ def mirrored(x, y):
 def test_it_is_the_direction_of_the_mirror(kind, tmp_path):
     lit = ball(tmp_path, GLOSSY[kind])
     for place in ((0.45, 0.4), (0.56, 0.45), (0.5, 0.55)):
-        off = highlight.direction(lit, 0, *place) @ mirrored(*place)
+        off = placement.highlighting(lit, 0, *place) @ mirrored(*place)
         assert np.degrees(np.arccos(min(off, 1.0))) < (0.1 if kind in ("coated", "glass") else 6.0)
 
 
 @pytest.mark.slow
 def test_a_light_that_is_put_there_is_seen_there(tmp_path):
     lit, (x, y) = ball(tmp_path, GLOSSY["rough"]), (0.42, 0.45)
-    azimuth, elevation = angles(highlight.direction(lit, 0, x, y))
+    azimuth, elevation = angles(placement.highlighting(lit, 0, x, y))
     light = {"azimuth": azimuth, "elevation": elevation, "flux": [1.0, 1.0, 1.0], "size": 3.0}
     sky = placed_lights.add(np.full((32, 64, 3), 1e-3, np.float32), [light])
     shown = lit.render(sky, 256).mean(axis=2)
@@ -59,12 +59,12 @@ def test_where_no_light_can_do_it_the_reason_is_told(tmp_path):
         (tmp_path / name).mkdir()
     lit = scene.load(write_scene(tmp_path / "a", SENSOR, LIGHT, BALL), width=32)
     with pytest.raises(NoPlaceError, match="not glossy"):
-        highlight.direction(lit, 0, 0.5, 0.5)
+        placement.highlighting(lit, 0, 0.5, 0.5)
     lit = ball(tmp_path / "b", GLOSSY["rough"], FLOOR)
     with pytest.raises(NoPlaceError, match="another object is reflected"):
-        highlight.direction(lit, 0, 0.5, 0.62)
-    highlight.direction(lit, 0, 0.5, 0.45)
+        placement.highlighting(lit, 0, 0.5, 0.62)
+    placement.highlighting(lit, 0, 0.5, 0.45)
     hidden = '<integrator type="path"><boolean name="hide_emitters" value="true"/></integrator>'
     lit = ball(tmp_path / "c", GLOSSY["coated"], hidden)
     with pytest.raises(NoPlaceError, match="not glossy"):
-        highlight.direction(lit, 0, 0.02, 0.02)
+        placement.highlighting(lit, 0, 0.02, 0.02)

@@ -5,8 +5,8 @@ import pytest
 
 from envedit.images import images
 from envedit.representations.layers.placed_lights import direction
-from envedit.scene import placement, scene, shadow
-from envedit.scene.camera_paths import NoPlaceError
+from envedit.scene import placement, scene
+from envedit.scene.placement import NoPlaceError
 from tests.oracles.builders import AHEAD, LIGHT, RIGHT, SENSOR, UP, write_scene
 from tests.unit.test_shadow import FLOOR, SMALL_BALL, on_picture
 
@@ -57,7 +57,7 @@ def test_a_shadow_falls_where_it_is_asked_for_from_the_direction_that_is_closest
     half = np.arcsin(0.5 / np.linalg.norm(FLOOR_POINT))
     for light in (direction(200.0, 40.0), direction(300.0, 70.0), None):
         toward = placement.shading(lit, 0, x, y, light)
-        point = shadow.occluder(lit, 0, x, y, toward)
+        point = placement.occluder(lit, 0, x, y, toward)
         assert np.linalg.norm(point) == pytest.approx(0.5, abs=1e-3), "the ball is not in between"
         # ---- Closest: on the great circle from the light to the ball, inside of its outline
         start = np.array([0.0, 1.0, 0.0]) if light is None else in_world(lit, light)

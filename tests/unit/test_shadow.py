@@ -1,12 +1,12 @@
-"""A light that is put where ``scene/shadow`` says casts its shadow to the place of the picture."""
+"""A light that is put where ``scene/placement`` says casts its shadow to the place of the picture."""
 
 import numpy as np
 import pytest
 
 from envedit.representations.layers import placed_lights
 from envedit.representations.layers.placed_lights import angles, direction
-from envedit.scene import scene, shadow
-from envedit.scene.camera_paths import NoPlaceError
+from envedit.scene import placement, scene
+from envedit.scene.placement import NoPlaceError
 from tests.oracles.builders import AHEAD, BALL, HALF, LIGHT, ORIGIN, RIGHT, SENSOR, UP, write_scene
 
 FLOOR = (
@@ -35,19 +35,19 @@ def on_picture(point):
 def test_the_occluder_is_found_and_the_light_follows_the_pointer(lit):
     sun = direction(60.0, 40.0)
     ground = -sun / sun[1]  # where the shadow of the ball's middle falls, on the plane y = -1
-    point = shadow.occluder(lit, 0, *on_picture(ground), sun)
+    point = placement.occluder(lit, 0, *on_picture(ground), sun)
     assert np.linalg.norm(point) == pytest.approx(0.5, abs=1e-3), "not the ball, or what lets light through"
     there = np.array([1.2, -1.0, 0.4])
-    toward = shadow.direction(lit, 0, *on_picture(there), point)
+    toward = placement.shadowing(lit, 0, *on_picture(there), point)
     assert toward @ (point - there) / np.linalg.norm(point - there) > np.cos(np.radians(0.2))
 
 
 @pytest.mark.slow
 def test_a_light_that_is_put_there_casts_its_shadow_there(lit):
     sun = direction(60.0, 40.0)
-    point = shadow.occluder(lit, 0, *on_picture(-sun / sun[1]), sun)
+    point = placement.occluder(lit, 0, *on_picture(-sun / sun[1]), sun)
     x, y = on_picture(np.array([1.0, -1.0, 0.5]))
-    azimuth, elevation = angles(shadow.direction(lit, 0, x, y, point))
+    azimuth, elevation = angles(placement.shadowing(lit, 0, x, y, point))
     light = {"azimuth": azimuth, "elevation": elevation, "flux": [1.0, 1.0, 1.0], "size": 2.0}
     shown = lit.render(placed_lights.add(np.full((32, 64, 3), 1e-3, np.float32), [light]), 64).mean(axis=2)
     row, column = int(y * 48), int(x * 64)
@@ -62,8 +62,8 @@ def test_where_there_is_no_shadow_the_reason_is_given(lit):
         (on_picture(front), -ORIGIN / np.linalg.norm(ORIGIN), "faces away"),
     ):
         with pytest.raises(NoPlaceError, match=reason):
-            shadow.occluder(lit, 0, *place, toward)
+            placement.occluder(lit, 0, *place, toward)
     with pytest.raises(NoPlaceError, match="no surface is seen"):
-        shadow.direction(lit, 0, 0.5, 0.02, np.zeros(3))
+        placement.shadowing(lit, 0, 0.5, 0.02, np.zeros(3))
     with pytest.raises(NoPlaceError, match="faces away"):
-        shadow.direction(lit, 0, *on_picture(np.array([1.2, -1.0, 0.0])), np.array([0.0, -2.0, 0.0]))
+        placement.shadowing(lit, 0, *on_picture(np.array([1.2, -1.0, 0.0])), np.array([0.0, -2.0, 0.0]))

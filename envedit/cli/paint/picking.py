@@ -14,8 +14,8 @@ from envedit.core.arrays import tensor
 from envedit.core.rows import Rows
 from envedit.representations.layers.oriented import oriented
 from envedit.representations.layers.placed_lights import PlacedLights, angles, direction, flux_of
-from envedit.scene import highlight, placement, shadow
-from envedit.scene.camera_paths import NoPlaceError
+from envedit.scene import placement
+from envedit.scene.placement import NoPlaceError
 from envedit.scene.scene import Scene
 from envedit.transport.light_transport import LightTransport
 
@@ -132,10 +132,10 @@ class Picking:
             light = shown[asked.light].direction if known else None
             return placement.shading(self.scene, view, asked.x, asked.y, light)
         if asked.of == "highlight":
-            return highlight.direction(self.scene, view, asked.x, asked.y)
+            return placement.highlighting(self.scene, view, asked.x, asked.y)
         if not asked.point:
             raise NoPlaceError("no shadow was picked")
-        return shadow.direction(self.scene, view, asked.x, asked.y, np.array(asked.point))
+        return placement.shadowing(self.scene, view, asked.x, asked.y, np.array(asked.point))
 
     def _shadowed(self, asked, view, listed):
         """Return the light of most flux whose shadow lies at a place, and what casts it."""
@@ -144,7 +144,7 @@ class Picking:
             if not listed[i].flux.any():
                 continue
             try:
-                point = shadow.occluder(self.scene, view, asked.x, asked.y, listed[i].direction)
+                point = placement.occluder(self.scene, view, asked.x, asked.y, listed[i].direction)
                 return {"light": i, "point": point.tolist()}
             except NoPlaceError as reason:
                 text = f"light {i + 1}: {reason}" if text == "the map has no light" else text

@@ -60,49 +60,6 @@ SMALL = 400
 """Pixels along a picture below which it is shown with sharp texels where it is enlarged."""
 MOST_DRAWN = 20
 """Lights that :func:`lights_figure` draws."""
-NUMBERS = {
-    "non_finite_steps": "steps that were not finite, and not taken",
-    "turn_degrees": "turn of the whole sky (degrees)",
-    "sun_offset_texels": "distance between the brightest texels of the edited and of the true map (texels)",
-    "active_rows": "rows that were edited, first and last",
-    "natural colours_outside": "share of the sky in colours that neither map has",
-    "natural seam": "step at the horizon over the original's",
-    "natural high_frequency": "detail of the sky over the original's",
-    "natural white": "share of the sky that is white, less the original's",
-    "natural patches": "patches of the edit, over those between two photographed skies",
-    "painted towards": "share of the painted change that is reached",
-    "painted elsewhere": "change of what was not painted (display values)",
-    "painted reachable": "share of the painted change that is feasible",
-    "fit log_psnr": "fit of the network, log-PSNR (dB)",
-    "fit peak_ratio": "fit, peak over the map's",
-    "fit epochs": "fit, epochs",
-    "fit cached": "fit taken from disk",
-    "transport cached": "light transport (T) taken from disk",
-    "transport entries": "light transport, entries",
-    "transport memory_bytes": "light transport, bytes",
-    "transport columns": "light transport, exact columns",
-    "transport samples": "light transport, samples a pixel",
-    "transport path_depth": "light transport, longest path",
-    "transport depth_error": "light transport, share of the light that longer paths would add",
-    "transport predicted_error": "light transport, predicted relative error",
-    "transport frozen": "share of texels that are frozen",
-}
-"""Numbers of metrics.json in words, where these are not their keys; our terms are in docs/glossary.md."""
-STAGES = {
-    "import": "importing",
-    "target": "rendering the target",
-    "fit": "fitting the representation",
-    "transport": "tracing the light transport, or reading it from disk",
-    "reach": "estimating what is feasible",
-    "start": "searching for lights",
-    "edit": "optimising",
-    "solve": "searching and optimising",
-    "judge": "rendering the result",
-    "full": "writing the maps, also at the resolution of the file",
-    "report": "writing the report",
-    "per_iteration": "one iteration",
-}
-"""Keys of the metrics' timing in words, without their units."""
 
 
 def show(value: object, digits: int = 4) -> str:

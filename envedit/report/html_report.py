@@ -14,10 +14,11 @@ import numpy as np
 
 from envedit import config
 from envedit.core.atomic_files import write_atomically
+from envedit.core.color import luminance
+from envedit.core.latlong import solid_angles
 from envedit.core.types import FilePath
 from envedit.losses.metrics import painted_verdict, saturated, score, worse
 from envedit.report import html_parts as parts
-from envedit.report import html_tables as tables
 from envedit.report import preview
 from envedit.report.curves import curves_svg, escape, normalised
 from envedit.report.manifest import plain
@@ -27,6 +28,64 @@ if TYPE_CHECKING:
 
 NAMED = 5
 """Numbers that are not finite which a warning names, at most."""
+NUMBERS = {
+    "non_finite_steps": "steps that were not finite, and not taken",
+    "turn_degrees": "turn of the whole sky (degrees)",
+    "sun_offset_texels": "distance between the brightest texels of the edited and of the true map (texels)",
+    "active_rows": "rows that were edited, first and last",
+    "natural colours_outside": "share of the sky in colours that neither map has",
+    "natural seam": "step at the horizon over the original's",
+    "natural high_frequency": "detail of the sky over the original's",
+    "natural white": "share of the sky that is white, less the original's",
+    "natural patches": "patches of the edit, over those between two photographed skies",
+    "painted towards": "share of the painted change that is reached",
+    "painted elsewhere": "change of what was not painted (display values)",
+    "painted reachable": "share of the painted change that is feasible",
+    "fit log_psnr": "fit of the network, log-PSNR (dB)",
+    "fit peak_ratio": "fit, peak over the map's",
+    "fit epochs": "fit, epochs",
+    "fit cached": "fit taken from disk",
+    "transport cached": "light transport (T) taken from disk",
+    "transport entries": "light transport, entries",
+    "transport memory_bytes": "light transport, bytes",
+    "transport columns": "light transport, exact columns",
+    "transport samples": "light transport, samples a pixel",
+    "transport path_depth": "light transport, longest path",
+    "transport depth_error": "light transport, share of the light that longer paths would add",
+    "transport predicted_error": "light transport, predicted relative error",
+    "transport frozen": "share of texels that are frozen",
+}
+"""Numbers of metrics.json in words, where these are not their keys; our terms are in docs/glossary.md."""
+STAGES = {
+    "import": "importing",
+    "target": "rendering the target",
+    "fit": "fitting the representation",
+    "transport": "tracing the light transport, or reading it from disk",
+    "reach": "estimating what is feasible",
+    "start": "searching for lights",
+    "edit": "optimising",
+    "solve": "searching and optimising",
+    "judge": "rendering the result",
+    "full": "writing the maps, also at the resolution of the file",
+    "report": "writing the report",
+    "per_iteration": "one iteration",
+}
+"""Keys of the metrics' timing in words, without their units."""
+_COMPARED = {
+    "initial": "initial rendering",
+    "render": "edited rendering",
+    "ceiling": "noise alone",
+    "initial_envmap": "unedited map",
+    "envmap": "edited map",
+}
+_MEASURES = {
+    "psnr": "PSNR (dB)",
+    "ssim": "SSIM",
+    "mse": "MSE",
+    "lpips": "LPIPS",
+    "log_rmse": "log RMSE (stops)",
+    "beyond_display": "share that a display does not show",
+}
 
 
 def write_report(path: FilePath, result: Result, manifest: dict) -> None:
@@ -70,10 +129,10 @@ def write_report(path: FilePath, result: Result, manifest: dict) -> None:
         _section("Photograph", _photograph(result)),
         _section("Other explanations", _variants(result, tonemap)),
         f"<h2>Losses</h2>{_losses(result.history, settings)}",
-        tables.quality(metrics),
-        tables.numbers(metrics),
-        tables.map_table(maps),
-        tables.timing(metrics),
+        _quality(metrics),
+        _numbers(metrics),
+        _map_table(maps),
+        _timing(metrics),
         f"<h2>Choices made</h2>{parts.listing(result.notes)}" if result.notes else "",
         f"<h2>Configuration</h2><pre>{escape(config.to_toml(settings))}</pre>",
         "<h2>Manifest</h2><details><summary>Versions, machine, seeds, inputs</summary>"
@@ -246,3 +305,89 @@ def _verdict(metrics):
     verdict += f" · {metrics['timing']['total_s']:.1f} s in total"
     line = f'<p class="verdict">{verdict}</p>'
     return line + (f'<p class="alarm">The edited rendering is {alarm}.</p>' if alarm else "")
+
+
+# ----------------------------------------------------------------------------------------------------------
+# Tables
+
+
+def _quality(metrics):
+    """Compare renderings, and maps where the true one is known, with the target; each view by itself."""
+    kinds = {name: words for name, words in _COMPARED.items() if metrics.get(name)}
+    rows = [
+        [words, *(parts.show(metrics[name][key]) for name in kinds)]
+        for key, words in _MEASURES.items()
+        if key != "lpips" or any(metrics[name][key] is not None for name in kinds)
+    ]
+    tables = "<h2>Quality</h2>" + parts.table(["", *kinds.values()], rows)
+    tables += (
+        '<p class="soft">Against the target, and the map that it was rendered under where that is known. '
+        f"All but log RMSE: under the tonemap {escape(metrics['tonemap'])}. "
+        "Noise alone: two renderings of the target's own map, or of the unedited one where the target "
+        "was painted; no rendering can be expected to be closer.</p>"
+    )
+    if metrics.get("views"):
+        kinds = {name: words for name, words in kinds.items() if "map" not in words}
+        head = [
+            "view",
+            *(f"{words}, {measure}" for measure in _MEASURES.values() for words in kinds.values()),
+        ]
+        rows = [
+            [f"{k} ({view['name']})", *(parts.show(view[name][key]) for key in _MEASURES for name in kinds)]
+            for k, view in enumerate(metrics["views"])
+        ]
+        tables += f"<h2>Views</h2>{parts.table(head, rows)}"
+    return tables
+
+
+def _numbers(metrics):
+    """List the other numbers of the metrics, in words where there are any."""
+    elsewhere = ("choices", "views", "variants", "tonemap", "worse")
+    others = {
+        key: value
+        for key, value in metrics.items()
+        if not isinstance(value, (dict, type(None))) and key not in elsewhere
+    }
+    for part in ("natural", "painted", "fit", "transport"):
+        others |= {f"{part} {key}": value for key, value in (metrics.get(part) or {}).items()}
+    rows = [[NUMBERS.get(key, key.replace("_", " ")), parts.show(value)] for key, value in others.items()]
+    return f"<details><summary>Numbers of the run</summary>{parts.table(['', ''], rows)}</details>"
+
+
+def _timing(metrics):
+    """List where the time went, with a bar for each stage."""
+    timing = {key: value for key, value in metrics["timing"].items() if value is not None}
+    longest = max(value for key, value in timing.items() if key.endswith("_s"))
+    rows = []
+    for key, value in timing.items():
+        stage, _, unit = key.rpartition("_")
+        width = 12 * value / max(longest, 1e-3) if unit == "s" else 0
+        bar = f'<span class="bar" style="width:{width:.2f}rem"></span>'
+        rows.append([STAGES.get(stage, stage.replace("_", " ")), f"{parts.show(value, 3)} {unit}", bar])
+    return f"<h2>Time</h2>{parts.table(['', '', ''], rows)}"
+
+
+def _map_table(maps):
+    """List peak, mean and median of every map."""
+    rows = [[name, *map_statistics(image)] for name, image in maps.items()]
+    head = ["map", "size", "peak luminance", "at row, column", "mean", "median", "lowest"]
+    return (
+        f"<h2>Environment maps</h2>{parts.table(head, rows)}\n"
+        '<p class="soft">Luminances are linear; the mean is over the sphere.</p>'
+    )
+
+
+def map_statistics(envmap: np.ndarray) -> list[str]:
+    """Return the table's cells for one map (H, W, 3): its size, luminances, and where the peak is."""
+    values = luminance(envmap.astype(np.float64))
+    height, width = values.shape
+    row, column = np.unravel_index(np.argmax(values), values.shape)
+    mean = float(np.average(values.mean(axis=1), weights=solid_angles(height, width)))
+    return [
+        f"{width} × {height}",
+        parts.show(values.max()),
+        f"{row}, {column}",
+        parts.show(mean),
+        parts.show(float(np.median(values))),
+        parts.show(values.min()),
+    ]

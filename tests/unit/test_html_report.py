@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from envedit import config
-from envedit.report import html_report, html_tables
+from envedit.report import html_report
 from envedit.report.curves import normalised
 from envedit.results import Result
 from envedit.solve.feasibility import Reach
@@ -180,7 +180,7 @@ def test_losses_are_drawn_with_their_last_weights():
 def test_map_statistics_weight_the_mean_by_solid_angle():
     image = grey(0.0, 33, 64)
     image[:8] = 2.0
-    cells = html_tables.map_statistics(image)
+    cells = html_report.map_statistics(image)
     # Eight of 33 rows aligned to the corners are a cap of angle pi * 7.5 / 32 around the pole.
     mean = 2.0 * (1 - np.cos(np.pi * 7.5 / 32)) / 2
     assert cells[:4] == ["64 × 33", "2", "0, 0", f"{mean:.4g}"] and cells[4:] == ["0", "0"]

@@ -4,12 +4,25 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from envedit.config.key_validators import MOST_DIM, Parameters, RowRange, View, ViewList
 from envedit.config.light_schema import LightList
 from envedit.config.region_schema import RegionList
 from envedit.config.stroke_schema import StrokeList
 from envedit.config.tables import EDITED, LAYERS, Table, key
-from envedit.config.validators import Boolean, Choice, Integer, Number, OneOrMore, OrAuto, String, show
+from envedit.config.validators import (
+    MOST_DIM,
+    Boolean,
+    Choice,
+    Integer,
+    Number,
+    OneOrMore,
+    OrAuto,
+    Parameters,
+    RowRange,
+    String,
+    View,
+    ViewList,
+    show,
+)
 from envedit.core import extensions
 from envedit.core.color import TONEMAPS
 from envedit.core.errors import ConfigError

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from envedit.config.key_validators import Ramp, Weight
 from envedit.config.tables import ADAM_STEPS, EDITED, LAYERS, SIREN, TRANSPORT, Table, key
-from envedit.config.validators import Boolean, Choice, Integer, Number, OrAuto, String
+from envedit.config.validators import Boolean, Choice, Integer, Number, OrAuto, Ramp, String, Weight
 from envedit.core import extensions
 from envedit.core.errors import ConfigError
 

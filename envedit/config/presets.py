@@ -1,22 +1,10 @@
-"""Sources of a configuration's values: presets, file and overrides, checked and laid over one another.
-
-Each source is a nested dict with the tables and keys of the configuration. ``top`` and ``tables`` are the
-fields of :class:`envedit.config.schema.Config` and of its tables, by name.
-"""
+"""Sources of a configuration's values, nested dicts of its tables: presets, and what is laid over them."""
 
 from __future__ import annotations
 
-import difflib
-import re
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
-
-from envedit.config.tables import checked
-from envedit.config.validators import meant, show
-from envedit.core.errors import ConfigError
-
-Fields = dict[str, Any]
 
 # Presets are nested dicts of defaults. "paper" is Sec. 6 of the paper, every number of it spelled out even
 # where it is a default today; the path tracer's samples a pixel and the rendering's size are not in it.
@@ -80,42 +68,6 @@ _PATHS = (
 
 MAP_WORDS = "auto", "scene", "sunsky"
 """What ``[input] envmap`` takes in place of a file."""
-
-
-def checked_layer(layer: Any, where: str, top: Fields, tables: dict[str, Fields]) -> dict[str, Any]:
-    """Check every table, key and value that one source gives, and normalise the values."""
-    if not isinstance(layer, dict):
-        raise ConfigError(f"{where}: got {show(layer)}, expected a table of tables")
-    found: dict[str, Any] = {}
-    try:
-        for name, value in layer.items():
-            if name in tables:
-                if not isinstance(value, dict):
-                    raise ConfigError(f"{name}: got {show(value)}, expected a table, [{name}]")
-                found[name] = {}
-                for key, entry in value.items():
-                    if key not in tables[name]:
-                        raise ConfigError(_unknown(key, name, top, tables))
-                    found[name][key] = checked(tables[name][key], f"{name}.{key}", entry)
-            elif name in top:
-                found[name] = checked(top[name], name, value)
-            else:
-                raise ConfigError(_unknown(name, "", top, tables))
-    except ConfigError as error:
-        raise ConfigError(f"{where}: {error}") from None
-    return found
-
-
-def _unknown(key: Any, table: str, top: Fields, tables: dict[str, Fields]) -> str:
-    """Say that a key is unknown, with the nearest name: of its own table first, then of any other."""
-    own = tables[table] if table else top
-    text = key[:60] if isinstance(key, str) else ""
-    shown = key if text == key and re.fullmatch(r"[\w-]{1,60}", text) else show(key)
-    kind = f"[{table}] has no key {shown}" if table else f"unknown table or key {shown}"
-    elsewhere = {k: f"{name}.{k}" for name, keys in tables.items() for k in keys} | {k: k for k in top}
-    close = difflib.get_close_matches(text, elsewhere, 1, 0.8)
-    hint = f"did you mean {elsewhere[close[0]]}?" if close else None
-    return f"{kind}; {meant(key, own, hint)}"
 
 
 def overlaid(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:

@@ -11,6 +11,7 @@ by itself, so that an error names the place the value came from.
 
 from __future__ import annotations
 
+import difflib
 import re
 import tomllib
 from collections.abc import Iterable
@@ -21,7 +22,7 @@ from typing import Any
 from envedit.config import presets
 from envedit.config.schema import FIELDS, TOP, Config
 from envedit.config.tables import checked
-from envedit.config.validators import show
+from envedit.config.validators import meant, show
 from envedit.core.atomic_files import opened
 from envedit.core.errors import ConfigError
 
@@ -101,14 +102,14 @@ def from_dict(
     overrides: Iterable[str] = (),
 ) -> Config:
     """Build a configuration from nested dicts with the tables and keys of the TOML file; see `loads`."""
-    file = presets.checked_layer(table, name, TOP, FIELDS)
+    file = _checked_layer(table, name)
     assigned: dict[str, Any] = {}
     for text in overrides:
         keys, value = parse_override(text)
         layer: Any = value
         for key in reversed(keys):
             layer = {key: layer}
-        layer = presets.checked_layer(layer, f"--set {show(text)}", TOP, FIELDS)
+        layer = _checked_layer(layer, f"--set {show(text)}")
         assigned = presets.overlaid(assigned, layer)
 
     chosen = assigned.get("preset", file.get("preset", "standard"))
@@ -123,6 +124,42 @@ def from_dict(
         return Config(**merged, **tables)
     except ConfigError as error:
         raise ConfigError(f"{name}: {error}") from None
+
+
+def _checked_layer(layer: Any, where: str) -> dict[str, Any]:
+    """Check every table, key and value that one source gives, and normalise the values."""
+    if not isinstance(layer, dict):
+        raise ConfigError(f"{where}: got {show(layer)}, expected a table of tables")
+    found: dict[str, Any] = {}
+    try:
+        for name, value in layer.items():
+            if name in FIELDS:
+                if not isinstance(value, dict):
+                    raise ConfigError(f"{name}: got {show(value)}, expected a table, [{name}]")
+                found[name] = {}
+                for key, entry in value.items():
+                    if key not in FIELDS[name]:
+                        raise ConfigError(_unknown(key, name))
+                    found[name][key] = checked(FIELDS[name][key], f"{name}.{key}", entry)
+            elif name in TOP:
+                found[name] = checked(TOP[name], name, value)
+            else:
+                raise ConfigError(_unknown(name, ""))
+    except ConfigError as error:
+        raise ConfigError(f"{where}: {error}") from None
+    return found
+
+
+def _unknown(key: Any, table: str) -> str:
+    """Say that a key is unknown, with the nearest name: of its own table first, then of any other."""
+    own = FIELDS[table] if table else TOP
+    text = key[:60] if isinstance(key, str) else ""
+    shown = key if text == key and re.fullmatch(r"[\w-]{1,60}", text) else show(key)
+    kind = f"[{table}] has no key {shown}" if table else f"unknown table or key {shown}"
+    elsewhere = {k: f"{name}.{k}" for name, keys in FIELDS.items() for k in keys} | {k: k for k in TOP}
+    close = difflib.get_close_matches(text, elsewhere, 1, 0.8)
+    hint = f"did you mean {elsewhere[close[0]]}?" if close else None
+    return f"{kind}; {meant(key, own, hint)}"
 
 
 def parse_override(text: str) -> tuple[tuple[str, ...], Any]:

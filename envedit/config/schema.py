@@ -17,10 +17,9 @@ from typing import Any
 
 from envedit.config import presets
 from envedit.config.input_schema import Input, Scene, Target
-from envedit.config.key_validators import Kelvin
 from envedit.config.method_schema import Fit, Loss, Optimizer, Perceptual, Renderer, Representation, Solve
 from envedit.config.tables import ADAM_STEPS, EDITED, SIREN, Table, key, table_key
-from envedit.config.validators import Boolean, Choice, Integer, Number, OrAuto, String
+from envedit.config.validators import Boolean, Choice, Integer, Kelvin, Number, OrAuto, String
 from envedit.core.color import TONEMAPS
 from envedit.core.errors import ConfigError
 

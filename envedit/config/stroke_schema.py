@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from envedit.config.key_validators import View
 from envedit.config.validators import (
     Check,
     Choice,
@@ -19,6 +18,7 @@ from envedit.config.validators import (
     Numbers,
     Schema,
     Tables,
+    View,
     WantedError,
     meant,
     named,

@@ -14,13 +14,12 @@ from typing import Any
 import numpy as np
 
 from envedit.config.input_schema import Target
-from envedit.config.key_validators import Kelvin
 from envedit.config.light_schema import LightList
 from envedit.config.method_schema import Solve
 from envedit.config.region_schema import RegionList
 from envedit.config.schema import FIELDS
 from envedit.config.stroke_schema import StrokeList
-from envedit.config.validators import Choice, Number, String, WantedError, show
+from envedit.config.validators import Choice, Kelvin, Number, String, WantedError, show
 from envedit.core.errors import ConfigError
 from envedit.core.rotations import Orientation
 

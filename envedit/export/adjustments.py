@@ -12,11 +12,10 @@ import numpy as np
 
 from envedit import config
 from envedit.core import latlong
-from envedit.core.color import luminance
 from envedit.core.errors import NumericalError
 from envedit.core.rows import bands
 from envedit.representations.layers import file_lights
-from envedit.targets.strokes import gains
+from envedit.targets.strokes import balance, gains
 
 WIDEST = 60.0
 """Largest radius in degrees over which a light is spread to keep to a bound."""
@@ -67,12 +66,6 @@ def adjust(
     if lights.soften_degrees or lights.max_radiance:
         notes += _soften(result, lights.soften_degrees, lights.max_radiance * scale)
     return result, notes
-
-
-def balance(kelvin: float) -> np.ndarray:
-    """Return factors (3,) that make the light of a black body neutral and keep the luminance of grey."""
-    gain = 1 / gains(kelvin)
-    return gain / float(luminance(gain))
 
 
 def spread(core: np.ndarray, degrees: float) -> np.ndarray:

@@ -20,7 +20,7 @@ from envedit.core.tone_curves import TONE_CURVES
 from envedit.core.types import FilePath, Shape
 from envedit.images import images
 from envedit.targets import alignment, painted_image
-from envedit.targets.strokes import gains
+from envedit.targets.strokes import balance, gains
 
 KELVIN = np.geomspace(2000, 25000, 400)
 """Temperatures that a white balance is looked for among."""
@@ -140,8 +140,8 @@ class Photo:
     @functools.cached_property
     def centre(self) -> np.ndarray:
         """Log factor that it is drawn to, (3,): of a known exposure and white balance, otherwise none."""
-        balance = np.zeros(3) if self.kelvin is None else np.log(_balance(self.kelvin))
-        return np.log(2) * (self.stops or 0.0) + balance
+        of_white = np.zeros(3) if self.kelvin is None else np.log(balance(self.kelvin))
+        return np.log(2) * (self.stops or 0.0) + of_white
 
     @property
     def picture(self) -> np.ndarray:
@@ -213,12 +213,6 @@ class Photo:
         camera, placed = Camera(curve, array[3:6]), alignment.Placement(*array[6:].tolist())
         photo = self.laid(self.values.shape, placed)
         return replace(photo, camera=camera, settled=bool(settled), recognised=bool(recognised))
-
-
-def _balance(kelvin):
-    """Return the factors (3,) of a white balance, under which grey keeps its luminance."""
-    gain = 1 / gains(kelvin)
-    return gain / float(luminance(gain))
 
 
 def read(

@@ -192,6 +192,12 @@ def gains(kelvin: float) -> np.ndarray:
     return gain / float(luminance(gain))
 
 
+def balance(kelvin: float) -> np.ndarray:
+    """Return factors (3,) that make the light of a black body neutral and keep the luminance of grey."""
+    gain = 1 / gains(kelvin)
+    return gain / float(luminance(gain))
+
+
 def chromaticity(kelvin: float) -> tuple[float, float]:
     """Return the CIE 1931 chromaticity x, y of a black body of 1667 to 25000 K.
 

@@ -11,9 +11,9 @@ import numpy as np
 from envedit import config, inputs
 from envedit.core.color import luminance
 from envedit.core.tone_curves import TONE_CURVES
-from envedit.export.adjustments import balance
 from envedit.targets.alignment import Placement
 from envedit.targets.photo import Camera
+from envedit.targets.strokes import balance
 
 PHOTO_SIZE = 3
 """Pixels of the photograph for one of the rendering, along each axis."""

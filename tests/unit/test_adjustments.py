@@ -9,7 +9,7 @@ from envedit.core.color import luminance
 from envedit.core.errors import ConfigError, NumericalError
 from envedit.export import adjustments
 from envedit.images import images
-from envedit.targets.strokes import gains
+from envedit.targets.strokes import balance, gains
 from tests.oracles import users_scenes
 from tests.oracles.maps import flux
 from tests.oracles.runs import call, changed, measured, pixels
@@ -49,7 +49,7 @@ def test_light_of_that_temperature_becomes_neutral(kelvin):
     envmap = np.float32(0.7) * np.ones((HEIGHT, WIDTH, 3), np.float32) * gains(kelvin).astype(np.float32)
     found, _ = adjusted(envmap, white_balance=kelvin)
     np.testing.assert_allclose(found, found[..., :1] * np.ones(3), rtol=1e-5)
-    np.testing.assert_allclose(luminance(adjustments.balance(kelvin)), 1, rtol=1e-9)
+    np.testing.assert_allclose(luminance(balance(kelvin)), 1, rtol=1e-9)
     if kelvin == 6500:
         np.testing.assert_allclose(found, envmap, rtol=1e-6)
 

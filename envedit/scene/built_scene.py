@@ -24,7 +24,7 @@ from envedit.core import latlong
 from envedit.core.errors import ConfigError, InputError
 from envedit.scene import scene as scenes
 from envedit.scene.scene import Scene
-from envedit.scene.supported import ROULETTE, OwnMap
+from envedit.scene.supported import ROULETTE, Integrator, OwnMap
 
 _CAMERAS = ("PerspectiveCamera", "ThinLensCamera", "OrthographicCamera")
 # Names of classes, of which an integrator written in Python has another in Python than in C++.
@@ -122,12 +122,22 @@ def wrapped(scene: Any, sensors: str | Sequence[int | str] = "all") -> Scene:
 
     # ---- Sensors and integrator
     width, views = scenes.views_of(scene, [c.id() or f"sensor {k}" for k, c in enumerate(cameras)])
-    unique = UNKNOWN + uuid.uuid4().hex
-    own = OwnMap(None, scale)
-    rows = views[-1].rows.stop
-    max_depth, rr_depth, hide, notes = _integrator(scene)
+    integrator = _integrator(scene)
     return Scene(
-        scene, None, width, rows, key, to_world, unique, params, views, own, max_depth, rr_depth, hide, notes
+        scene,
+        path=None,
+        width=width,
+        height=views[-1].rows.stop,
+        envmap_key=key,
+        to_world=to_world,
+        digest=UNKNOWN + uuid.uuid4().hex,
+        params=params,
+        views=views,
+        own=OwnMap(None, scale),
+        max_depth=integrator.max_depth,
+        rr_depth=integrator.rr_depth,
+        hide_emitters=integrator.hide_emitters,
+        notes=integrator.notes,
     )
 
 
@@ -169,8 +179,8 @@ def _rotation(transform: Any) -> np.ndarray:
     return rotation
 
 
-def _integrator(scene: Any) -> tuple[int, int, bool, tuple[str, ...]]:
-    """Return max_depth, rr_depth, hide_emitters and notes, as :func:`.supported.take_integrator`."""
+def _integrator(scene: Any) -> Integrator:
+    """Read what the integrator asks for, as :func:`.supported.take_integrator`."""
     integrator = scene.integrator()
     media = any(shape.is_medium_transition() for shape in scene.shapes())
     names = {"PathIntegrator"}
@@ -183,12 +193,12 @@ def _integrator(scene: Any) -> tuple[int, int, bool, tuple[str, ...]]:
     if media:
         notes.append("the scene's medium is not rendered, as its integrator has no media")
     if names & _DIRECT:
-        return 2, ROULETTE, hide, tuple(notes)
+        return Integrator(2, ROULETTE, hide, tuple(notes))
     if not names & (_PATHS | _VOLUMES):
         kind = integrator.class_name()
         notes.append(f"integrator {kind} is not used: rendered by path, with paths of any length")
-        return -1, ROULETTE, hide, tuple(notes)
+        return Integrator(-1, ROULETTE, hide, tuple(notes))
     printed = dict(re.findall(r"(\w+_depth) = (\d+)", str(integrator)))
     depth = int(printed.get("max_depth", _ANY_DEPTH))
     roulette = int(printed.get("rr_depth", getattr(integrator, "rr_depth", ROULETTE)))
-    return (-1 if depth >= _ANY_DEPTH else depth), roulette, hide, tuple(notes)
+    return Integrator(-1 if depth >= _ANY_DEPTH else depth, roulette, hide, tuple(notes))

@@ -568,14 +568,7 @@ def _check_parameters(path: Path, parameters: dict) -> tuple[dict[str, str], sce
         )
     filled = {}
     for name, value in parameters.items():
-        if isinstance(value, bool):
-            value = "true" if value else "false"
-        elif isinstance(value, float | np.floating) and not np.isfinite(value):
-            raise ConfigError(f"scene.parameters: {name} is {value}, expected a finite number")
-        elif not isinstance(value, str | os.PathLike | int | float | np.integer | np.floating):
-            kind = type(value).__name__
-            raise ConfigError(f"scene.parameters: {name} is a {kind}, expected text or a number")
-        filled[name] = str(value)
+        filled[name] = str(value).lower() if isinstance(value, bool) else str(value)
     return filled, outline
 
 

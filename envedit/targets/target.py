@@ -11,6 +11,7 @@ painted stay as they are: their target is their initial rendering.
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -173,7 +174,10 @@ def _of_paint(settings, scene, envmap, picture, mask, hidden):
         asked = _bytes_of_files(chosen)
         source = f"painted: {', '.join(chosen.files)}"
     else:
-        painted = _painted_strokes(scene, initial, chosen)
+        painted = painted_strokes(scene, initial, chosen.strokes, chosen.display_tonemap)
+        if not painted.coverage.any():
+            what = "; ".join(painted.warnings) or "none of them paints anything"
+            raise InputError(f"target.strokes: {what}")
         source = f"painted: {len(chosen.strokes)} strokes on the initial rendering"
     if chosen.kind == "image" and mask is None and not chosen.masks:
 
@@ -305,24 +309,24 @@ def _painted_files(scene, initial, settings):
     return _of_views(scene, initial, painted, of_view)
 
 
-def _painted_strokes(scene, initial, chosen):
-    """Paint strokes, each on its view."""
-    numbers = [
-        scene.view(s.get("view", 0), f"target.strokes[{i}].view") for i, s in enumerate(chosen.strokes)
-    ]
+def painted_strokes(
+    scene: Scene, picture: np.ndarray, painted: Sequence[dict], tonemap: str
+) -> strokes.Painted:
+    """Paint strokes on a picture of all views (h, w, 3), each on its own; as of :func:`.strokes.paint`.
+
+    ConfigError if a stroke is of a view that the scene has not.
+    """
+    numbers = [scene.view(s.get("view", 0), f"target.strokes[{i}].view") for i, s in enumerate(painted)]
     warnings: list[str] = []
 
     def of_view(k, before):
         own = [i for i, number in enumerate(numbers) if number == k]
-        made = strokes.paint(before, [chosen.strokes[i] for i in own], chosen.display_tonemap)
+        made = strokes.paint(before, [painted[i] for i in own], tonemap)
         warnings.extend(_renumbered(line, own) for line in made.warnings)
         nothing = np.zeros(before.shape, bool)
         return replace(made, excluded=nothing[..., 0], clipped=nothing, warnings=())
 
-    painted = _of_views(scene, initial, numbers, of_view)
-    if not painted.coverage.any():
-        raise InputError(f"target.strokes: {'; '.join(warnings) or 'none of them paints anything'}")
-    return replace(painted, warnings=tuple(warnings))
+    return replace(_of_views(scene, picture, numbers, of_view), warnings=tuple(warnings))
 
 
 def _renumbered(line, own):

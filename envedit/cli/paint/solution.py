@@ -28,6 +28,7 @@ from envedit.solve import gauss_newton, hold, map_problem, prior, search
 from envedit.solve.likelihood import SIGMA, Likelihood
 from envedit.targets import strokes
 from envedit.targets.pixel_weights import first_hold, hidden_pixels, pixel_weight
+from envedit.targets.target import painted_strokes
 from envedit.transport.light_transport import LightTransport
 
 COLUMNS = 32
@@ -174,14 +175,9 @@ class Solution:
 
     def _on_views(self, before, painted):
         """Paint strokes, each on its view, over what was painted before."""
-        picture, coverage = before.picture.copy(), before.coverage.copy()
-        views = [self.scene.view(one.get("view", 0), "target.strokes.view") for one in painted]
-        for view in sorted(set(views)):
-            rows = self.scene.rows[view]
-            own = [one for one, on in zip(painted, views, strict=True) if on == view]
-            made = strokes.paint(picture[rows], own, self.settings.target.display_tonemap)
-            picture[rows], coverage[rows] = made.picture, 1 - (1 - coverage[rows]) * (1 - made.coverage)
-        return strokes.Painted(picture, coverage)
+        tonemap_name = self.settings.target.display_tonemap
+        made = painted_strokes(self.scene, before.picture, painted, tonemap_name)
+        return replace(made, coverage=1 - (1 - before.coverage) * (1 - made.coverage))
 
     # ---- steps ---------------------------------------------------------------------------------------------
 

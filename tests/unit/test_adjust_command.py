@@ -10,8 +10,8 @@ from envedit.core import latlong, primaries
 from envedit.core.color import luminance
 from envedit.core.rotations import Orientation
 from envedit.images import images
-from envedit.maps import map_file, sphere
-from envedit.maps.adjusted import Adjustments, adjusted
+from envedit.maps import map_file
+from envedit.maps.adjusted import Adjustments, adjusted, blur
 from envedit.representations.layers import oriented
 from tests.oracles.maps import flux
 
@@ -58,10 +58,10 @@ def test_the_middle_is_raised_and_clockwise_is_clockwise():
 @pytest.mark.parametrize("degrees", [3.0, 20.0, 120.0])
 def test_a_blur_keeps_flux_and_a_constant_and_has_the_width_that_is_asked(degrees, rng):
     even = np.full((HEIGHT, WIDTH, 3), 0.7, np.float32)
-    np.testing.assert_allclose(sphere.blur(even, degrees), even, rtol=1e-6)
+    np.testing.assert_allclose(blur(even, degrees), even, rtol=1e-6)
     envmap = np.zeros_like(even)
     envmap[20, 33] = 1
-    blurred = sphere.blur(envmap, degrees)
+    blurred = blur(envmap, degrees)
     np.testing.assert_allclose(flux(blurred), flux(envmap), rtol=1e-5)
     if degrees < 30:  # mean of 1 - cos is s^2 on the plane
         cosine = latlong.directions(HEIGHT, WIDTH) @ latlong.directions(HEIGHT, WIDTH)[20, 33]

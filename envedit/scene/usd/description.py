@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import hashlib
+import os
 import xml.etree.ElementTree as ET
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pxr import Ar
 
 from envedit.core.errors import InputError
 
@@ -52,6 +55,30 @@ class Description:
         """Return the path of a file beside the XML, and its name in the XML."""
         (self.folder / self.files).mkdir(exist_ok=True)
         return self.folder / self.files / name, f"{self.files}/{name}"
+
+    def texture_file(self, path: Any, asset: Any) -> str:
+        """Return the name of a texture's file in the XML: an absolute path, or a copy out of a package.
+
+        ``path`` (pxr.Sdf.Path) is the prim that names it, ``asset`` (pxr.Sdf.AssetPath) its value. InputError
+        if there is no such file.
+        """
+        resolved = asset.resolvedPath
+        if not resolved:
+            what = "tiles (UDIM) are not read" if "<UDIM>" in asset.path else "the file is missing"
+            raise self.error(path, f"texture {asset.path}: {what}")
+        if not Ar.IsPackageRelativePath(resolved):
+            if not os.path.isfile(resolved):
+                raise self.error(path, f"texture {asset.path}: the file is missing")
+            self.textures.add(os.path.abspath(resolved))
+            return os.path.abspath(resolved)
+        opened = Ar.GetResolver().OpenAsset(Ar.ResolvedPath(resolved))
+        if not opened:
+            raise self.error(path, f"texture {asset.path}: the file is missing in the package")
+        inner = Ar.SplitPackageRelativePathInner(resolved)[1]
+        short = hashlib.sha256(resolved.encode()).hexdigest()[:8]
+        copy, name = self.new_file(f"{short}_{Path(inner).name}")
+        copy.write_bytes(opened.GetBuffer())
+        return name
 
 
 def add(parent: ET.Element, tag: str, plugin: str = "", name: str = "", **values: Any) -> ET.Element:

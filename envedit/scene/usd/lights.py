@@ -15,7 +15,6 @@ from pxr import UsdGeom, UsdLux
 
 from envedit.core import rotations
 from envedit.images import images
-from envedit.scene.usd import assets
 from envedit.scene.usd.description import Description, add
 
 NEUTRAL = {"diffuse": 1.0, "specular": 1.0, "shaping:focus": 0.0, "shaping:ies:file": None}
@@ -113,7 +112,7 @@ def _add_dome(scene, prim, to_world, radiance):
     layout = _value(scene, prim, "inputs:texture:format", "automatic")
     if layout not in ("automatic", "latlong"):
         raise scene.error(path, f"got a dome texture of format {layout}, expected latlong")
-    file = assets.texture_file(scene, path, texture)
+    file = scene.texture_file(path, texture)
     scale = float(radiance.mean())
     if np.ptp(radiance) > 1e-6 * scale:
         scene.leave_out("colour of a dome light: multiplied into a copy of its map", path)

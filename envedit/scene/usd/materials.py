@@ -11,7 +11,6 @@ import mitsuba as mi
 import numpy as np
 from pxr import Gf, UsdGeom, UsdShade
 
-from envedit.scene.usd import assets
 from envedit.scene.usd.description import Description, add, add_matrix, column_matrix, put
 
 PREVIEW, OPEN_PBR = "UsdPreviewSurface", "ND_open_pbr_surface_surfaceshader"
@@ -141,7 +140,7 @@ def _texture(scene, surface, shader, output, channels):
     asset = _value(shader.GetInput("file"), scene.time, None)
     if asset is None or not asset.path:
         raise scene.error(path, "the texture names no file")
-    file = assets.texture_file(scene, path, asset)
+    file = scene.texture_file(path, asset)
     space = _value(shader.GetInput("sourceColorSpace"), scene.time, "auto")
     raw = space == "raw" or (space == "auto" and channels == 1)
     wrap = _value(shader.GetInput("wrapS"), scene.time, "useMetadata")

@@ -30,6 +30,8 @@ FORMATS = (
 """Kind, first bytes and decoder of every format."""
 ARRAY = "array"
 """What a map that came as an array is called, where others have the name of their file."""
+DEFAULT = "edited"
+"""The layer of a file of several that is plain R, G, B: what a program shows that knows of no layers."""
 
 
 # ---- Reading -----------------------------------------------------------------------------------------------
@@ -270,6 +272,37 @@ def write_exr(
     if alpha is not None:
         planes["A"] = np.asarray(alpha, np.float32)
     exr.write(name, planes, chromaticities, panorama, metadata)
+
+
+def write_layers(
+    path: FilePath, layers: dict[str, np.ndarray], chromaticities: primaries.Chromaticities | None = None
+) -> None:
+    """Write layers as one float32 OpenEXR file, whole or not at all.
+
+    The layer ``edited``, or else the first, becomes the channels ``R``, ``G``, ``B``; any other NAME becomes
+    ``NAME.R``, ``NAME.G``, ``NAME.B``, and one of two dimensions ``NAME.Y``. One part, marked as lat-long
+    with ``chromaticities``; None: Rec. 709.
+
+    Layers (H, W, 3) or (H, W) are linear radiance, or anything else with a value a texel, all of one size;
+    the one that becomes R, G, B has three channels. NumericalError for a value that is not finite in float32
+    names the layer and the first texel; InputError if the file cannot be written.
+    """
+    name = os.fsdecode(path)
+    default = DEFAULT if DEFAULT in layers else next(iter(layers))
+    planes = {}
+    size = np.shape(layers[default])[:2]
+    for layer, values in layers.items():
+        values = np.asarray(values)
+        colour = values.ndim == 3 and values.shape[2] == 3
+        if not (colour or values.ndim == 2 and layer != default) or values.shape[:2] != size or 0 in size:
+            raise ValueError(
+                f"{name}: layer '{layer}' has shape {values.shape}, expected {size} with 3 channels"
+            )
+        values = finite(name, values, f"texels of layer '{layer}'")
+        prefix = "" if layer == default else f"{layer}."
+        for i, channel in enumerate("RGB" if colour else "Y"):
+            planes[prefix + channel] = values[..., i] if colour else values
+    exr.write(name, planes, chromaticities)
 
 
 def write_hdr(

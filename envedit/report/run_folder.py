@@ -14,7 +14,7 @@ from envedit import config, inputs
 from envedit.core import atomic_files
 from envedit.core.errors import InputError, NumericalError
 from envedit.export import file_resolution
-from envedit.images import images, layered_exr
+from envedit.images import images
 from envedit.losses.perceptual import installed
 from envedit.report import html_report, manifest, map_files, output_folder, preview, variants
 from envedit.solve import checkpoint
@@ -127,7 +127,7 @@ def _write_maps(folder, result):
         layers["influence"] = result.influence
     if result.posterior is not None:
         layers["deviation"] = result.posterior.deviation
-    layered_exr.write(folder / "edited_layers.exr", layers, chromaticities=input_map.chromaticities)
+    images.write_layers(folder / "edited_layers.exr", layers, chromaticities=input_map.chromaticities)
     result.warnings += variants.write(folder / variants.FOLDER, result.variants, output, input_map)
     if result.photo is not None:
         pictures = preview.photograph(result.photo, result.render, result.outliers)

@@ -21,7 +21,7 @@ from envedit.cli.progress import Progress
 from envedit.core import atomic_files
 from envedit.core.errors import InputError
 from envedit.core.seeds import Seeds
-from envedit.images import images, layered_exr
+from envedit.images import images
 from envedit.report import manifest, output_folder, preview
 from envedit.scene import scene
 from envedit.solve import adam_loop, checkpoint
@@ -287,7 +287,7 @@ STATE = adam_loop.State(3, history=ROWS)
 RESULT = {"renders": {"initial": PICTURE, "target": PICTURE, "edited": PICTURE}, "maps": {"initial": PICTURE}}
 WRITERS = {
     "edited.exr": lambda path: images.write_exr(path, PICTURE),
-    "edited_layers.exr": lambda path: layered_exr.write(path, {"edited": PICTURE, "grey": PICTURE[..., 0]}),
+    "edited_layers.exr": lambda path: images.write_layers(path, {"edited": PICTURE, "grey": PICTURE[..., 0]}),
     "influence.png": lambda path: preview.influence(path, PICTURE[..., 0], None),
     "preview.png": lambda path: atomic_files.write_atomically(
         path, preview.sheet(RESULT["renders"], RESULT["maps"])

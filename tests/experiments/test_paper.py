@@ -9,7 +9,7 @@ import pytest
 
 from envedit import config
 from envedit.core.errors import ConfigError, InputError
-from envedit.images import images, layered_exr
+from envedit.images import images
 from envedit.losses.perceptual.installed import DISTS_WEIGHT
 from experiments import harness, puresky
 from experiments.__main__ import main
@@ -193,7 +193,7 @@ def finish(out, made, part="", *, numbers=SOME, fit_s=None, cached=False, resume
         (folder / "config.toml").write_text(job.toml)
         edited = np.full((8, 16, 3), 0.5, np.float32)
         images.write_exr(folder / "edited.exr", edited)
-        layered_exr.write(folder / "edited_layers.exr", {"edited": edited, "initial": edited})
+        images.write_layers(folder / "edited_layers.exr", {"edited": edited, "initial": edited})
         for name, value in (("target", 0.4), ("edited", 0.7)):
             images.write_exr(folder / f"render_{name}.exr", np.full((6, 6, 3), value, np.float32))
         timing_fit = 0.2 if cached else fit_s or 0.0

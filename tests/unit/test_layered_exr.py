@@ -6,7 +6,7 @@ import OpenEXR
 import pytest
 
 from envedit.core.errors import InputError, NumericalError
-from envedit.images import images, layered_exr
+from envedit.images import images
 from tests.oracles.builders import grey
 
 SIZE = (8, 16)
@@ -22,7 +22,7 @@ def parts(rng):
 
 def test_layers_come_back_by_name_and_other_programs_see_the_edited_map(tmp_path, parts):
     path = tmp_path / "layers.exr"
-    layered_exr.write(path, parts)
+    images.write_layers(path, parts)
     file = OpenEXR.File(str(path), separate_channels=True)
     assert len(file.parts) == 1, "one part: many viewers show only the first"
     channels = file.channels()
@@ -48,9 +48,9 @@ def test_layers_come_back_by_name_and_other_programs_see_the_edited_map(tmp_path
 
 def test_without_an_edited_map_the_first_is_the_default(tmp_path):
     path = tmp_path / "a.exr"
-    layered_exr.write(path, {"sky": grey(2.0), "sun": grey(3.0)})
+    images.write_layers(path, {"sky": grey(2.0), "sun": grey(3.0)})
     assert (images.read(path)[0] == 2).all()
-    layered_exr.write(path, {"only": grey(4.0)})  # replaced
+    images.write_layers(path, {"only": grey(4.0)})  # replaced
     assert sorted(OpenEXR.File(str(path), separate_channels=True).channels()) == ["B", "G", "R"]
 
 
@@ -60,10 +60,10 @@ def test_threads_are_as_they_were(tmp_path):
     before = OpenEXR.global_thread_count()
     OpenEXR.set_global_thread_count(3)
     try:
-        layered_exr.write(tmp_path / "a.exr", {"edited": grey(1.0)})
+        images.write_layers(tmp_path / "a.exr", {"edited": grey(1.0)})
         assert OpenEXR.global_thread_count() == 3
         with pytest.raises(InputError):
-            layered_exr.write(tmp_path / "none" / "a.exr", {"edited": grey(1.0)})
+            images.write_layers(tmp_path / "none" / "a.exr", {"edited": grey(1.0)})
         assert OpenEXR.global_thread_count() == 3
     finally:
         OpenEXR.set_global_thread_count(before)
@@ -72,20 +72,20 @@ def test_threads_are_as_they_were(tmp_path):
 @pytest.mark.parametrize("bad", [np.nan, np.inf, 1e300])
 def test_values_that_are_not_finite_are_refused(tmp_path, bad):
     path = tmp_path / "a.exr"
-    layered_exr.write(path, {"edited": grey(1.0)})
+    images.write_layers(path, {"edited": grey(1.0)})
     before = path.read_bytes()
     broken = grey(0.0).astype(np.float64)
     broken[3, 5, 1] = bad
     with pytest.raises(NumericalError, match="1 texels of layer 'difference'.*row 3, column 5"):
-        layered_exr.write(path, {"edited": grey(1.0), "difference": broken})
+        images.write_layers(path, {"edited": grey(1.0), "difference": broken})
     with pytest.raises(NumericalError, match="layer 'influence'.*row 3, column 5"):
-        layered_exr.write(path, {"edited": grey(1.0), "influence": broken[..., 1]})
+        images.write_layers(path, {"edited": grey(1.0), "influence": broken[..., 1]})
     assert path.read_bytes() == before and len(list(tmp_path.iterdir())) == 1
 
 
 @pytest.mark.parametrize("shape", [(8, 16, 4), (8, 16, 1), (4, 16, 3), (4, 16), (0, 16, 3)])
 def test_layers_of_another_shape_are_refused(tmp_path, shape):
     with pytest.raises(ValueError, match="layer 'other' has shape"):
-        layered_exr.write(tmp_path / "a.exr", {"edited": grey(1.0), "other": np.zeros(shape)})
+        images.write_layers(tmp_path / "a.exr", {"edited": grey(1.0), "other": np.zeros(shape)})
     with pytest.raises(ValueError, match="layer 'edited' has shape"):
-        layered_exr.write(tmp_path / "a.exr", {"edited": np.zeros(SIZE)})
+        images.write_layers(tmp_path / "a.exr", {"edited": np.zeros(SIZE)})

@@ -18,9 +18,6 @@ from envedit.config.validators import (
     Schema,
     String,
     Tables,
-    meant,
-    named,
-    show,
 )
 from envedit.core.errors import ConfigError
 
@@ -107,13 +104,8 @@ class LightList(Tables):
         return found
 
     def _entry(self, name: str, light: dict[str, Any]) -> dict[str, Any]:
-        keys = OWN if "light" in light else ADDED
-        for unknown in (k for k in light if k not in keys):
-            hint = meant(unknown, dict.fromkeys(["light", *keys]))
-            raise ConfigError(f"{name}: has no key {show(unknown)}; {hint}")
-        found = {
-            key: named(f"{name}.{key}", check, light[key]) for key, check in keys.items() if key in light
-        }
+        keys = OWN if "light" in light else {"light": OWN["light"]} | ADDED
+        found = self._checked(name, light, keys)
         if ("azimuth" in found) != ("elevation" in found):
             raise ConfigError(f"{name}: got one of azimuth and elevation, expected both or none")
         if "light" in light:

@@ -16,8 +16,6 @@ from envedit.config.validators import (
     Schema,
     Tables,
     WantedError,
-    meant,
-    named,
     show,
 )
 from envedit.core.errors import ConfigError
@@ -84,11 +82,7 @@ class RegionList(Tables):
     most = MOST_REGIONS
 
     def _entry(self, name: str, region: dict[str, Any]) -> dict[str, Any]:
-        for unknown in (key for key in region if key not in KEYS):
-            raise ConfigError(f"{name}: has no key {show(unknown)}; {meant(unknown, KEYS)}")
-        found = {
-            key: named(f"{name}.{key}", check, region[key]) for key, check in KEYS.items() if key in region
-        }
+        found = self._checked(name, region, KEYS)
         if "action" not in found:
             raise ConfigError(f"{name}.action: got none, expected one of {', '.join(ACTIONS)}")
         if ("points" in found) == ("polygon" in found):

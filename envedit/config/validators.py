@@ -93,6 +93,12 @@ class Tables(Check):
     @abstractmethod
     def _entry(self, name: str, table: dict[str, Any]) -> dict[str, Any]: ...
 
+    def _checked(self, name: str, table: dict[str, Any], keys: dict[str, Check]) -> dict[str, Any]:
+        """Return the values of an entry, in the order of the keys that it may have."""
+        for unknown in (key for key in table if key not in keys):
+            raise ConfigError(f"{name}: has no key {show(unknown)}; {meant(unknown, keys)}")
+        return {key: named(f"{name}.{key}", check, table[key]) for key, check in keys.items() if key in table}
+
     @property
     def range(self) -> str:
         """How many."""

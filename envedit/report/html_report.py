@@ -247,8 +247,10 @@ def _photograph(result):
         f"red: not explained by light, {100 * result.metrics['camera']['outliers']:.3g} % of the pixels",
     )
     pictures = preview.photograph(result.photo, result.render, result.outliers)
-    codes = [np.rint(255 * one).astype(np.uint8) for one in pictures]
-    return [parts.figure(*one) for one in zip(codes, captions, strict=True)]
+    return [
+        parts.figure(np.rint(255 * values).astype(np.uint8), caption)
+        for values, caption in zip(pictures, captions, strict=True)
+    ]
 
 
 def _variants(result, tonemap):

@@ -216,8 +216,8 @@ def read(text: str | bytes, client: str = "") -> Edit | Pick | Choose | Open | A
             phase = found.get("phase", "done")
             if phase not in PHASES:
                 raise BadMessageError(f"phase: got {show(phase)[:80]}, expected one of {', '.join(PHASES)}")
-            counts = (_count(found.get(name, 0)) for name in ("number", "painting"))
-            return Edit(document(found.get("document")), phase, client, *counts)
+            number, painting = _count(found.get("number", 0)), _count(found.get("painting", 0))
+            return Edit(document(found.get("document")), phase, client, number, painting)
         if kind == "pick":
             x, y = (Number(0, 1)(found.get(name)) for name in "xy")
             light = int(Number(-1, 100)(found.get("light", -1)))

@@ -142,12 +142,11 @@ def opened(name: str, envmap: str = "", preset: str | None = None, camera: str =
     )
     if settings.target.kind == "photo":
         return _continued(_of_photo(settings, base))
-    painted = file is not None and file.name == NAME
-    folder = file.absolute().parent if file and painted else Path(settings.output.dir)
-    plain = _plain(settings, folder)
-    if painted:
-        return Project(plain, folder, base, document, True, settings.optimizer.start)
-    return _continued(Project(plain, folder, base, document))
+    if file is not None and file.name == NAME:
+        folder = file.absolute().parent
+        plain = _plain(settings, folder)
+        return Project(plain, folder, base, document, again=True, start=settings.optimizer.start)
+    return _continued(Project(settings, Path(settings.output.dir), base, document))
 
 
 def on_another_map(before: Project, document: Document, envmap: str) -> Project:
@@ -172,9 +171,9 @@ def _of_photo(settings, base):
     photo = replace(settings, output=_without(settings.output, dir=str(matched.parent), format="exr"))
     given = settings.input.given_values
     kept = {name: given[name] for name in ("width", "rows", "horizon") if name in given}
-    plain = _plain(replace(settings, lights=config.Lights()), folder)
-    plain = replace(plain, input=config.Input(envmap=str(matched), **kept))
-    return Project(plain, folder, base, Document(), photo=None if matched.exists() else photo)
+    matched_input = config.Input(envmap=str(matched), **kept)
+    settings = replace(settings, lights=config.Lights(), input=matched_input)
+    return Project(settings, folder, base, Document(), photo=None if matched.exists() else photo)
 
 
 def _path(envmap):
@@ -203,17 +202,15 @@ def _without(table, *names, **more):
 def _continued(project):
     """Go on from a ``painted.toml`` of the same scene and map; of another, in a folder beside it."""
     folder, tried = project.folder, 1
+    settings = project.settings
     while (folder / NAME).exists():
-        try:
+        with contextlib.suppress(ConfigError):  # not ours to overwrite
             before = config.load(folder / NAME)
-            one, other = before, project.settings
-            if (one.scene, one.input.envmap) == (other.scene, other.input.envmap):
+            if before.scene == settings.scene and before.input.envmap == settings.input.envmap:
                 return replace(opened(str(folder / NAME)), base=project.base)
-        except ConfigError:
-            pass  # not ours to overwrite
         tried += 1
         folder = project.folder.with_name(f"{project.folder.name}-{tried}")
-    return replace(project, settings=_plain(project.settings, folder), folder=folder)
+    return replace(project, settings=_plain(settings, folder), folder=folder)
 
 
 def recent() -> list[dict]:

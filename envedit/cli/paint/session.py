@@ -351,10 +351,7 @@ class Session:
         self.solution.search(self._unless_newer)
         if self.solution.run is not before:
             self._rendered = None
-        self._tell_explanations()
-        self._show()
-        self._tell_lights()
-        self.tell_state()
+        self._tell_solution()
 
     def _hold_more(self):
         """Give more weight to what was not painted, if that is due."""
@@ -382,10 +379,7 @@ class Session:
         self.solution.choose(index)
         self._rendered, self.resting, self.advised = None, False, False
         self.status = {"iterations": 0, **{name: self.status[name] for name in ("steps", "number", "client")}}
-        self._tell_explanations()
-        self._show()
-        self._tell_lights()
-        self.tell_state()
+        self._tell_solution()
 
     def _unless_newer(self, *_):
         self._give_back_memory()
@@ -518,9 +512,13 @@ class Session:
         if self.photograph is not None:
             self.tell.frame("photograph", "transport", self.photograph)
         self._tell_unreachable()
+        self._rendered = None
+        self._tell_solution()
+
+    def _tell_solution(self):
+        """Show the solution, and say what it is."""
         self._tell_explanations()
         self._show()
-        self._rendered = None
         self._tell_lights()
         self.tell_state()
 

@@ -194,11 +194,9 @@ def _by_hand(settings, input_map):
         placed = PlacedLights(input_map.radiance, settings.horizon)
         changed = placed.by_hand(settings.lights, settings.regions)
         if lacking := missing(settings.lights, len(placed.lights)):
-            count = len(placed.lights)
-            known = f"the map has {count} light{'s' if count != 1 else ''}"
-            entries = "entry is" if len(lacking) == 1 else "entries are"
             numbers = ", ".join(map(str, lacking))
-            warnings.append(f"input.lights: got light = {numbers}, but {known}; the {entries} ignored")
+            has = f"the map has {len(placed.lights)}: what is said of others is ignored"
+            warnings.append(f"input.lights: got light = {numbers}, but {has}")
     else:
         changed = ByHand(map_regions.changed(input_map.radiance, settings.regions))
     return replace(

@@ -85,15 +85,13 @@ def _unclip(arguments, console):
 
 
 def _check(arguments):
-    if arguments.flux is not None:
-        if len(arguments.flux) not in (1, 3):
-            raise ConfigError(f"--flux: got {len(arguments.flux)} numbers, expected 1 or 3")
-        if not all(math.isfinite(value) and value >= 0 for value in arguments.flux) or not any(
-            arguments.flux
-        ):
-            raise ConfigError(f"--flux: got {arguments.flux}, expected positive numbers")
-    if arguments.ratio is not None and not (math.isfinite(arguments.ratio) and arguments.ratio > 0):
-        raise ConfigError(f"--ratio: got {arguments.ratio}, expected a positive number")
+    flux, ratio = arguments.flux, arguments.ratio
+    if flux is not None and len(flux) not in (1, 3):
+        raise ConfigError(f"--flux: got {len(flux)} numbers, expected 1 or 3")
+    if flux is not None and not (min(flux) >= 0 and 0 < sum(flux) < math.inf):
+        raise ConfigError(f"--flux: got {flux}, expected positive numbers")
+    if ratio is not None and not 0 < ratio < math.inf:
+        raise ConfigError(f"--ratio: got {ratio}, expected a positive number")
 
 
 def _flux(arguments, light):

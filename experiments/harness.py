@@ -51,6 +51,8 @@ from experiments import call
 from experiments.summary import markdown, values
 
 NOTHING = "no case is done by this version of the program; run computes them"
+SHOWING = {b"harness", b"summary"}
+"""Modules that decide what is shown of a case, and not its numbers."""
 GAP = 3
 """Pixels between the rows of a sheet."""
 
@@ -82,13 +84,13 @@ def calling(
     """Make a case that calls a function in place of ``envedit run``.
 
     The function, of a module, is (settings, folder, **arguments) -> the metrics of the case; arguments are
-    those of JSON. The code of its folder, and of the experiments that this imports from, is part of the
+    those of JSON. The code of its folder, and of what this imports from ``experiments``, is part of the
     version.
     """
     folder = Path(inspect.getfile(function)).parent
-    imported = re.findall(rb"^from experiments\.(\w+)", code_of(folder), re.M)
-    folders = [folder, *(Path(__file__).parent / one.decode() for one in sorted(set(imported)))]
-    code = hashlib.sha256(b"".join(map(code_of, folders))).hexdigest()
+    imported = set(re.findall(rb"^from experiments\.(\w+)", code_of(folder), re.M)) - SHOWING
+    places = [folder, *(Path(__file__).parent / one.decode() for one in sorted(imported))]
+    code = hashlib.sha256(b"".join(map(code_of, places))).hexdigest()
     where = f"{function.__module__}:{function.__name__}"
     given = json.dumps(arguments, sort_keys=True)
     command = "{python}", str(Path(call.__file__).absolute()), where, "{folder}", "{threads}", given
@@ -97,8 +99,9 @@ def calling(
 
 @functools.cache
 def code_of(folder: Path) -> bytes:
-    """Return the Python files of a folder, one after the other."""
-    return b"\0".join(file.read_bytes() for file in sorted(folder.glob("*.py")))
+    """Return the Python files of a folder, one after the other; or the module of this name."""
+    files = sorted(folder.glob("*.py")) or [folder.with_suffix(".py")]
+    return b"\0".join(file.read_bytes() for file in files)
 
 
 @dataclass(frozen=True)
@@ -165,7 +168,7 @@ class Experiment:
     """What is run, measured and shown."""
 
     cases: Callable[[argparse.Namespace], list[Case]]  # of the parsed command line
-    # A row of numbers, or several; with the case's ``about``, the columns are made of them
+    # A row of numbers, or several, or an empty one, which is left out; columns also know the case's ``about``
     measure: Callable[[Done], dict | list[dict]] = lambda done: done.metrics
     # Heading -> format string, or callable of the row that returns the text; or this of each group. Without
     # columns the summary is all
@@ -178,7 +181,7 @@ class Experiment:
     combine: Callable[[list[dict]], list[dict]] = lambda rows: rows  # all rows -> rows of the table
     # A row of the sheet: pictures of display values, of any size; no pictures: no row
     panels: Callable[[Done], list[np.ndarray]] = edit_panels
-    sheet: Callable[[Case], str] = lambda case: "sheet"  # name of the sheet, a PNG; or with the ending .jpg
+    sheet: Callable[[Case], str] = lambda case: "sheet.jpg"  # name of its file; without ending: a PNG
     options: Callable[[argparse.ArgumentParser], None] = lambda parser: None  # adds the experiment's own
     # In place of panels: all cases with their jobs, folders of runs and sheets, command line -> files
     draw: Callable[[list, Path, Path, argparse.Namespace], list[Path]] | None = None
@@ -208,10 +211,12 @@ def carry_out(cases, out: Path, given, stream=None) -> list[sweep.Outcome]:
 
 def rows_of(experiment: Experiment, done: Iterable[Done]) -> list[dict]:
     """Return what is known of each case, a row or several; numbers are as of :func:`.values`."""
-    found = [(one.case.about, experiment.measure(one)) for one in done]
-    return [
-        about | values(row) for about, rows in found for row in (rows if isinstance(rows, list) else [rows])
-    ]
+    rows = []
+    for one in done:
+        measured = experiment.measure(one)
+        of_case = measured if isinstance(measured, list) else [measured]
+        rows += [one.case.about | values(row) for row in of_case if row]
+    return rows
 
 
 def table(experiment: Experiment, rows: list[dict]) -> str:

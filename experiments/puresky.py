@@ -1,4 +1,4 @@
-"""The PureSky maps that experiments are made over: those that a folder holds, by name."""
+"""The maps that experiments are made over, by name: those of the folder that ENVEDIT_DATA names."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from pathlib import Path
 
 from envedit.config.validators import meant
 from envedit.core.errors import ConfigError, InputError
+from experiments.harness import Case, calling
 
 _NAME = re.compile(r"(?P<name>.+)_puresky_(?P<size>[1-9][0-9]?)k\.(?P<kind>hdr|exr)")
 _HOW = "python -m experiments.download_puresky DIR fetches them"
@@ -55,3 +56,11 @@ def file(name: str) -> str:
         hint = meant(name, found, f"there are {', '.join(found)}")
         raise ConfigError(f"no map {name}; {hint}")
     return str(found[name])
+
+
+def cases(function, tables: dict | None = None, **arguments) -> list[Case]:
+    """Return a case for each PureSky map, in which a function is called with its ``file``."""
+    return [
+        calling(name, function, tables or {}, {"map": name}, file=str(path), **arguments)
+        for name, path in find().items()
+    ]

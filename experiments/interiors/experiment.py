@@ -138,5 +138,4 @@ EXPERIMENT = Experiment(
         "seam": "{natural[seam]:.1f}",
     },
     panels=panels,
-    sheet=lambda case: "sheet.jpg",
 )

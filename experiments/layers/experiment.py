@@ -47,8 +47,7 @@ def measure(done: Done) -> dict:
     original, edited, true = done.maps
     directions = latlong.directions(*true.shape[:2])[rows]
     omega = latlong.solid_angles(*true.shape[:2])[rows, None]
-    row, column = metrics.peak_position(true[rows])
-    near = directions @ directions[row, column] > np.cos(np.radians(LIGHT_DEGREES))
+    near = directions @ directions[metrics.peak_position(true[rows])] > np.cos(np.radians(LIGHT_DEGREES))
     flux = [float((luminance(m[rows]) * omega)[near].sum()) for m in (edited, true)]
     sharp = [metrics.high_frequency_energy(m[rows]) for m in (edited, original, true)]
     sunny = float(luminance(original[rows]).max()) > SUNNY

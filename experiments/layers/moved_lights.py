@@ -11,10 +11,10 @@ from envedit.core.arrays import tensor
 from envedit.core.color import LUMINANCE, tonemap
 from envedit.core.rotations import rotated, rotation_vector
 from envedit.images import images
-from envedit.losses import metrics
 from envedit.representations.layers.layers import SCALES, Layers
 from experiments import puresky
-from experiments.harness import Done, Experiment, calling
+from experiments.harness import Experiment
+from experiments.measures import psnr
 from experiments.summary import Summary
 
 WIDTH = 128
@@ -54,21 +54,17 @@ def compare(settings, folder, file: str) -> dict:
         logs = [np.log(one @ LUMINANCE + FAINT)[near] for one in (edited, true)]
         off = np.subtract(*logs)
         white = [(tonemap(one)[near].min(axis=1) >= 1).mean() for one in (edited, true)]
-        psnr = [metrics.psnr(tonemap(one), tonemap(true)) for one in (edited, image)]
-        found.append([psnr[0], psnr[1], np.sqrt(np.square(off).mean()), off.mean(), white[0] - white[1]])
+        found.append(
+            [
+                psnr(edited, true),
+                psnr(image, true),
+                np.sqrt(np.square(off).mean()),
+                off.mean(),
+                white[0] - white[1],
+            ]
+        )
     names = "map_psnr", "unedited", "rms", "bias", "white"
     return dict(zip(names, np.mean(found, axis=0).tolist(), strict=True))
-
-
-def cases(args):
-    return [
-        calling(name, compare, {}, {"map": name}, file=str(file))
-        for name, file in sorted(puresky.find().items())
-    ]
-
-
-def measure(done: Done) -> list[dict]:
-    return [done.metrics] if done.metrics else []
 
 
 def columns(statistic: str = "") -> dict[str, str]:
@@ -83,8 +79,7 @@ def columns(statistic: str = "") -> dict[str, str]:
 
 
 EXPERIMENT = Experiment(
-    cases,
-    measure,
-    {"map": "{map}"} | columns(),
+    lambda given: puresky.cases(compare),
+    columns={"map": "{map}"} | columns(),
     summary=Summary({}, {"maps": "{runs}"} | columns(".mean")),
 )

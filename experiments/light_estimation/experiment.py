@@ -14,6 +14,7 @@ from envedit.representations.layers.separation import separate
 from experiments import puresky
 from experiments.harness import Case, Done, Experiment
 from experiments.light_estimation import protocol
+from experiments.measures import irradiance_error, lights_error, peak_error
 from experiments.summary import Summary
 
 COUNT = 6
@@ -61,14 +62,14 @@ def measure(done: Done) -> list[dict]:
         for sphere, picture in pictures(envmap).items():
             errors = protocol.compared(picture, expected[sphere])
             rows.append(about | {"sphere": sphere} | errors)
-        stops = np.abs(protocol.irradiance_error(envmap, true))
-        measures = {
-            "peak": protocol.peak_error(envmap, true),
-            "lights": protocol.lights_error(lights[when], true_lights),
+        stops = np.abs(irradiance_error(envmap, true))
+        of_map = {
+            "peak": peak_error(envmap, true),
+            "lights": lights_error(lights[when], true_lights),
             "stops": float(stops.mean()),
             "worst": float(stops.max()),
         }
-        rows.append(about | {"sphere": ""} | measures)
+        rows.append(about | {"sphere": ""} | of_map)
     return rows
 
 
@@ -139,6 +140,5 @@ EXPERIMENT = Experiment(
     group=lambda row: "Spheres" if row["sphere"] else "Maps",
     summary=summary,
     panels=panels,
-    sheet=lambda case: "sheet.jpg",
     options=options,
 )

@@ -1,4 +1,4 @@
-"""The evaluator of light estimation: three spheres under a tonemapped map, and what is measured.
+"""The evaluator of light estimation: three spheres under a tonemapped map, and measures of their pictures.
 
 StyleLight's (Wang et al. 2022), which DiffusionLight (Phongthawee et al. 2024) and LuxDiT (Liang et al.
 2025) use, ported from Blender's Cycles to Mitsuba. The map is resized to 256x128 texels and tonemapped, and
@@ -13,7 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from envedit.core import latlong
-from envedit.core.color import luminance, tonemap
+from envedit.core.color import tonemap
 
 HEIGHT, WIDTH = 128, 256
 """Texels of the map."""
@@ -28,8 +28,6 @@ FILM, CROP = (960, 540), 300
 RADIUS = 0.9896
 """Of the sphere: Blender's subdivided mesh is smaller than 1; the area of the ground truth's alpha."""
 SPP, SEED = 16, 900_001
-AXES = np.concatenate([np.eye(3), -np.eye(3)])[[0, 3, 1, 4, 2, 5]]
-"""Normals of the planes: +x, -x, +y, -y, +z, -z."""
 _GRAY = {"type": "rgb", "value": 0.8}
 
 
@@ -106,7 +104,7 @@ def display(picture: np.ndarray) -> np.ndarray:
     return tonemap(np.kron(shown, np.ones((reduction, reduction, 1))), "gamma")
 
 
-# ---- Measures of pictures ----------------------------------------------------------------------------------
+# ---- Measures --------------------------------------------------------------------------------------------
 
 
 def compared(estimate: np.ndarray, true: np.ndarray) -> dict[str, float]:
@@ -124,7 +122,8 @@ def compared(estimate: np.ndarray, true: np.ndarray) -> dict[str, float]:
     factor = (a * b).sum() / max((a * a).sum(), 1e-30)
     lengths = np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1)
     coloured = lengths > 0
-    angles = _degrees((a * b).sum(axis=1)[coloured] / lengths[coloured])
+    cosine = (a * b).sum(axis=1)[coloured] / lengths[coloured]
+    angles = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
     return {
         "rmse": _rmse(a, b),
         "si_rmse": _rmse(factor * a, b),
@@ -140,62 +139,3 @@ def _rmse(a, b):
 def _scaled(picture):
     low, high = np.percentile(picture, (0.01, 99.9))
     return (picture - low) / (high - low) if high > low else np.zeros_like(picture)
-
-
-# ---- Measures of maps --------------------------------------------------------------------------------------
-
-
-def peak_error(estimate: np.ndarray, true: np.ndarray) -> float:
-    """Return the angle between the brightest texels of two maps (H, W, 3), degrees.
-
-    NaN if a map has the same luminance everywhere.
-    """
-    peaks = []
-    for envmap in (estimate, true):
-        values = luminance(envmap)
-        if values.max() == values.min():
-            return float("nan")
-        peaks.append(latlong.directions(*values.shape)[np.unravel_index(values.argmax(), values.shape)])
-    return _degrees(peaks[0] @ peaks[1])
-
-
-def lights_error(estimate: list[dict], true: list[dict], count: int = 5) -> float:
-    """Return how far the lights of two maps are from each other, degrees (EnvMapNet, Somanath and Kurz 2021).
-
-    Lights are those of ``lights.json``, the strongest first; ``count`` of either list count, and not more
-    than the shorter one has, or two. The angle to the nearest light of the other list: mean over the lights
-    of a list, mean of both lists; NaN if there is no light in one of them.
-    """
-    if not estimate or not true:
-        return float("nan")
-    count = min(count, max(len(estimate), 2), max(len(true), 2))
-    a, b = (_directions(lights[:count]) for lights in (estimate, true))
-    angles = _degrees(a @ b.T)
-    return float((angles.min(axis=0).mean() + angles.min(axis=1).mean()) / 2)
-
-
-def irradiance(envmap: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """Return the irradiance (n, 3) under a map (H, W, 3) on planes that face unit vectors (n, 3)."""
-    size = envmap.shape[:2]
-    light = np.float64(envmap) * latlong.lookup_solid_angles(*size)[:, None, None]
-    cosines = np.maximum(latlong.directions(*size) @ normals.T, 0)
-    return np.einsum("hwc,hwn->nc", light, cosines)
-
-
-def irradiance_error(estimate: np.ndarray, true: np.ndarray) -> np.ndarray:
-    """Return the difference of irradiance on planes that face +x, -x, +y, -y, +z, -z, (6,) stops.
-
-    Of luminance; of maps (H, W, 3). 0 where neither map lights a plane, infinite where one does.
-    """
-    a, b = (luminance(irradiance(envmap, AXES)) for envmap in (estimate, true))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(a == b, 0.0, np.log2(a / b))
-
-
-def _directions(lights):
-    theta = np.radians([90 - light["elevation"] for light in lights])
-    return latlong.on_sphere(theta, np.radians([light["azimuth"] for light in lights]))
-
-
-def _degrees(cosine):
-    return np.degrees(np.arccos(np.clip(cosine, -1, 1)))

@@ -15,7 +15,8 @@ from envedit.images import images
 from envedit.maps import look_transfer, looks, map_file
 from envedit.scene import scene
 from experiments import puresky
-from experiments.harness import Case, Done, Experiment, calling
+from experiments.harness import Done, Experiment
+from experiments.measures import degrees
 
 LOOK = Path(__file__).parent / "evening.toml"
 WIDTH = 256
@@ -25,13 +26,8 @@ ASKED = 0.1
 """Most stops by which the key light's flux over the sky's irradiance may be off."""
 
 
-def cases(args) -> list[Case]:
-    scenes = {"scene": {"file": "sphere"}}
-    found = puresky.find().items()
-    look = LOOK.read_text()
-    return [
-        calling(name, in_its_light, scenes, {"map": name}, file=str(file), look=look) for name, file in found
-    ]
+def cases(given):
+    return puresky.cases(in_its_light, {"scene": {"file": "sphere"}}, look=LOOK.read_text())
 
 
 def in_its_light(settings, folder: Path, file: str, look: str) -> dict:
@@ -70,15 +66,15 @@ def photometry(envmap: np.ndarray, toward: np.ndarray) -> tuple[float, float]:
     height, width, _ = envmap.shape
     d = latlong.directions(height, width)
     omega = latlong.lookup_solid_angles(height, width)[:, None]
-    apart = np.degrees(np.arccos(np.clip(d @ toward, -1, 1)))
+    apart = degrees(d, toward)
     light = envmap.astype(np.float64) @ LUMINANCE
     inside = apart < APERTURE
     around = np.median(light[(apart >= APERTURE) & (apart < RING)])
     flux = np.where(inside, np.maximum(light - around, 0), 0) * omega
     sky = np.where(inside, np.minimum(light, around), light) * omega * np.maximum(d[..., 1], 0)
     centre = (flux[..., None] * d).sum(axis=(0, 1))
-    cosine = centre @ toward / np.linalg.norm(centre)
-    return float(np.log2(flux.sum() / sky.sum())), float(np.degrees(np.arccos(min(cosine, 1))))
+    centre /= np.linalg.norm(centre)
+    return float(np.log2(flux.sum() / sky.sum())), float(degrees(centre, toward))
 
 
 def failures(rows: list[dict]) -> list[str]:
@@ -112,5 +108,4 @@ EXPERIMENT = Experiment(
     },
     failures=failures,
     panels=panels,
-    sheet=lambda case: "sheet.jpg",
 )

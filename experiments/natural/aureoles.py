@@ -7,7 +7,7 @@ from envedit.images import images
 from envedit.representations.layers import aureoles
 from envedit.representations.layers.layers import Layers
 from experiments import puresky
-from experiments.harness import Experiment, calling
+from experiments.harness import Experiment
 
 WIDTH = 512
 DEGREES = (2, 5, 10, 20, 40)
@@ -29,13 +29,6 @@ def measure_glow(settings, folder, file: str) -> dict:
     return {"flux": float(flux), "glow": luminance(glows[strongest])[list(DEGREES)].tolist()}
 
 
-def cases(args):
-    return [
-        calling(name, measure_glow, {}, {"map": name}, file=str(file))
-        for name, file in puresky.find().items()
-    ]
-
-
 def summary(rows) -> str:
     """Return the power of the flux that the glow goes with."""
     if len(rows) < 3:
@@ -46,9 +39,8 @@ def summary(rows) -> str:
 
 
 EXPERIMENT = Experiment(
-    cases,
-    lambda done: [done.metrics] if done.metrics else [],
-    {"map": "{map}", "flux over sky": "{flux:.2f}"}
+    lambda given: puresky.cases(measure_glow),
+    columns={"map": "{map}", "flux over sky": "{flux:.2f}"}
     | {f"glow at {degrees}°": f"{{glow[{k}]:.1f}}" for k, degrees in enumerate(DEGREES)},
     summary=summary,
     combine=lambda rows: sorted(rows, key=lambda row: row["flux"]),

@@ -9,12 +9,11 @@ import hashlib
 import itertools
 from pathlib import Path
 
-import numpy as np
-
 from envedit.core.atomic_files import make_folder
 from envedit.images import analytic_sky, images
 from experiments import puresky
 from experiments.harness import Case, Done, Experiment
+from experiments.measures import SAME, psnr
 from experiments.summary import Summary
 
 SCENES = {
@@ -29,8 +28,6 @@ ANGLES, OTHERS = (60, 140), (1, 4, 8)
 ELEVATIONS, ELEVATION = (5, 10, 20, 50, 65, 80), 35
 """Of the analytic sky's sun, degrees: targets, and before."""
 WIDTH = 256
-SAME = 120.0
-"""PSNR from which two maps are taken to be the same, dB."""
 
 
 def options(parser):
@@ -94,12 +91,6 @@ def picked(made: list[Case], args, kinds: tuple[str, ...] = ("kind", "turn", "sc
 
 def _digest(text):
     return hashlib.sha256(text.encode()).hexdigest()
-
-
-def psnr(a, b) -> float:
-    """PSNR of display values; at most :data:`SAME`."""
-    shown = [np.clip(np.float64(m), 0, 1) ** (1 / 2.2) for m in (a, b)]
-    return float(-10 * np.log10(max(np.square(shown[0] - shown[1]).mean(), 10 ** (-SAME / 10))))
 
 
 def gained(done: Done, part: slice) -> float | None:

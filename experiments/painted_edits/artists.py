@@ -14,6 +14,7 @@ from envedit.core.color import tonemap
 from envedit.targets import initial_rendering
 from experiments import puresky
 from experiments.harness import Case, Done, Experiment, calling
+from experiments.measures import degrees
 from experiments.natural.skies import KEPT
 from experiments.painted_edits import one_light
 from experiments.painted_edits.experiment import PAINT, STATISTICS, explanation
@@ -105,8 +106,8 @@ def carry_out(settings, folder, edit: str) -> dict:
     flux = [sum(light["flux"]) for light in lights]
     off = None
     if paint.sun is not None and lights:
-        cosine = np.dot(lights[int(np.argmax(flux))]["direction"], scene.to_world @ paint.sun)
-        off = float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+        brightest = np.array(lights[int(np.argmax(flux))]["direction"])
+        off = float(degrees(brightest, scene.to_world @ paint.sun))
     return {
         **result.metrics,
         **result.metrics["painted"],

@@ -17,6 +17,7 @@ from envedit.targets.photo import Camera
 from experiments import puresky
 from experiments.harness import Done, Experiment, calling
 from experiments.light_estimation import protocol
+from experiments.measures import brightest, irradiance_error, peak_error
 from experiments.photograph.adam import edited_by_adam
 from experiments.photograph.cameras import CAMERAS, photograph
 from experiments.photograph.insertion import Plate
@@ -132,16 +133,16 @@ def sunlit(envmap) -> float:
     """Return the share of the ground's irradiance that comes from within :data:`SUN_DEGREES` of the sun."""
     towards = latlong.directions(*envmap.shape[:2])
     light = luminance(np.float64(envmap)) * latlong.lookup_solid_angles(*envmap.shape[:2])[:, None]
-    sun = towards[np.unravel_index(luminance(envmap).argmax(), light.shape)]
+    sun = brightest(envmap)
     on_ground = light * np.maximum(towards[..., 1], 0)
     return float(on_ground[towards @ sun > np.cos(np.radians(SUN_DEGREES))].sum() / on_ground.sum())
 
 
 def measured(envmap, true) -> dict:
     """Compare a map with the true one: the sun, irradiance, and the three spheres."""
-    stops = protocol.irradiance_error(envmap, true)
+    stops = irradiance_error(envmap, true)
     found = {
-        "sun": protocol.peak_error(envmap, true),
+        "sun": peak_error(envmap, true),
         "brightness": float(stops.mean()),
         "irradiance": float(np.abs(stops - stops.mean()).mean()),
     }
@@ -206,6 +207,5 @@ EXPERIMENT = Experiment(
     },
     summary=SUMMARY,
     panels=panels,
-    sheet=lambda case: "sheet.jpg",
     options=options,
 )

@@ -15,7 +15,8 @@ from envedit.core.color import tonemap
 from envedit.images import images
 from experiments import plain_mitsuba, puresky
 from experiments.harness import Done, Experiment, calling
-from experiments.natural.experiment import picked, psnr
+from experiments.measures import psnr
+from experiments.natural.experiment import picked
 from experiments.summary import Summary
 
 SCENES = ("sphere", "statue", "matpreview")

@@ -13,7 +13,7 @@ from envedit.core.color import linear_to_srgb, luminance, srgb_to_linear
 from envedit.images import images
 from envedit.representations.layers.clipped_light import CORE_DEGREES
 from envedit.representations.layers.separation import separate
-from experiments.light_estimation.protocol import irradiance
+from experiments.measures import degrees, irradiance
 
 KEPT = ("evening_road_01", "kloppenheim_06", "rustig_koppie", "syferfontein_18d_clear")
 """Maps that no choice and no constant has seen: every third by name."""
@@ -79,7 +79,7 @@ def truth(radiance: np.ndarray, name: str) -> Truth:
     direction /= np.linalg.norm(direction)
 
     # ---- As much as stands out within the core, and what is left for the sky
-    angle = np.degrees(np.arccos(np.clip(directions @ direction, -1, 1)))
+    angle = degrees(directions, direction)
     around = (angle > 1.5 * CORE_DEGREES) & (angle < 2.5 * CORE_DEGREES)
     core = angle < CORE_DEGREES
     flux = float((np.maximum(lum - np.median(lum[around]), 0) * omega)[core].sum())

@@ -12,6 +12,7 @@ from envedit.representations.layers import unclip
 from envedit.representations.layers.clipped_light import RING_DEGREES
 from experiments import puresky
 from experiments.harness import Experiment, calling, markdown
+from experiments.measures import degrees
 from experiments.unclip import clipping
 
 CLEAR = ("autumn_field", "kloofendal_48d_partly_cloudy", "sunflowers")
@@ -23,11 +24,11 @@ def measure_sun(settings, folder, file: str, map_name: str) -> dict:
     radiance = clipping.load(file)
     true = clipping.truth(radiance, map_name)
     directions = latlong.directions(*radiance.shape[:2])
-    angle = np.degrees(np.arccos(np.clip(directions @ true.direction, -1, 1)))
+    angle = degrees(directions, true.direction)
     lum = luminance(radiance)
     aureole = []
-    for degrees in RING_DEGREES[: len(unclip.AUREOLE)]:
-        ring = (angle > degrees * 2**-0.25) & (angle < degrees * 2**0.25) & (directions[..., 1] > 0)
+    for radius in RING_DEGREES[: len(unclip.AUREOLE)]:
+        ring = (angle > radius * 2**-0.25) & (angle < radius * 2**0.25) & (directions[..., 1] > 0)
         aureole.append(float(np.log2(np.median(lum[ring]) / true.flux)))
     elevation = float(np.degrees(np.arcsin(true.direction[1])))
     sun, sky = unclip.analytic_fluxes(elevation)
@@ -59,9 +60,9 @@ def summary(rows) -> str:
     # ---- Every map by the constants of the others
     errors = {name: _errors(suns, name) for name in suns}
     rows = []
-    for ring, degrees in enumerate(RING_DEGREES[: len(unclip.AUREOLE)]):
+    for ring, radius in enumerate(RING_DEGREES[: len(unclip.AUREOLE)]):
         some = [errors[name][:, ring] for name in CLEAR + LOW]
-        rows.append([f"{degrees:.1f}", *(" ".join(f"{e:+.1f}" for e in one) for one in some)])
+        rows.append([f"{radius:.1f}", *(" ".join(f"{e:+.1f}" for e in one) for one in some)])
     head = ["first ring, degrees", *(f"{name}: aureole, sky, both" for name in CLEAR + LOW)]
     lines.append(markdown(head, rows))
     near = RING_DEGREES[: len(unclip.AUREOLE)] <= unclip.NEAR_DEGREES
@@ -101,7 +102,4 @@ def _errors(suns, name):
     return np.stack([by_aureole, by_sky, both])
 
 
-EXPERIMENT = Experiment(
-    cases,
-    summary=summary,
-)
+EXPERIMENT = Experiment(cases, summary=summary)

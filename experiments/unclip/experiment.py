@@ -10,6 +10,7 @@ from envedit.images import images
 from envedit.representations.layers import clipped_light, unclip
 from experiments import puresky
 from experiments.harness import Experiment, calling
+from experiments.measures import degrees
 from experiments.summary import Summary
 from experiments.unclip import clipping
 
@@ -45,9 +46,7 @@ def measure_map(settings, folder, file: str, map_name: str) -> list[dict]:
                 flux = float(luminance(estimate.flux))
                 result = unclip.restored(image, light, estimate.flux)
         pictures = [shadow.render(one / np.float32(exposure)) for one in (image, result)]
-        off = (
-            np.degrees(np.arccos(np.clip(light.direction @ true.direction, -1, 1))) if light else float("nan")
-        )
+        off = degrees(light.direction, true.direction) if light else float("nan")
         rows.append(
             {
                 "level": level,
@@ -144,5 +143,4 @@ EXPERIMENT = Experiment(
     group=lambda row: f"{row['set']}, {'sunny' if row['sunny'] else 'not sunny'}",
     summary=summary,
     panels=panels,
-    sheet=lambda case: "sheet.jpg",
 )

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from envedit.core import latlong
+from experiments import measures
 from experiments.light_estimation import experiment, protocol
 
 TRUTH = Path(os.environ.get("ENVEDIT_DATA", ".")) / "evaluation" / "ground_truth" / "stylelight"
@@ -62,31 +63,31 @@ def test_errors_are_those_worked_out_by_hand(found, true, expected):
 def test_angle_between_brightest_directions():
     found, true = constant(), constant()
     found[4, 0], true[4, 4] = 2, 3  # a quarter of the horizon
-    assert protocol.peak_error(found, true) == pytest.approx(90)
+    assert measures.peak_error(found, true) == pytest.approx(90)
     true[0, 7] = 9  # the zenith
-    assert protocol.peak_error(found, true) == pytest.approx(90) and protocol.peak_error(true, true) == 0
-    assert math.isnan(protocol.peak_error(constant(), true))
-    assert math.isnan(protocol.peak_error(true, constant(0)))
+    assert measures.peak_error(found, true) == pytest.approx(90) and measures.peak_error(true, true) == 0
+    assert math.isnan(measures.peak_error(constant(), true))
+    assert math.isnan(measures.peak_error(true, constant(0)))
 
 
 def test_lights_are_compared_both_ways_and_at_most_five():
-    assert protocol.lights_error(lights(0), lights(0, 90)) == pytest.approx(22.5)
-    assert protocol.lights_error(lights(0, 90), lights(0)) == pytest.approx(22.5)
-    assert protocol.lights_error(lights(0), lights(0, 90, 180)) == pytest.approx(22.5)
+    assert measures.lights_error(lights(0), lights(0, 90)) == pytest.approx(22.5)
+    assert measures.lights_error(lights(0, 90), lights(0)) == pytest.approx(22.5)
+    assert measures.lights_error(lights(0), lights(0, 90, 180)) == pytest.approx(22.5)
     six = lights(0, 10, 20, 30, 40, 50)
-    assert protocol.lights_error(six, lights(0, 10, 20, 30, 40, 180)) == pytest.approx(0, abs=1e-5)
-    assert math.isnan(protocol.lights_error([], six)) and math.isnan(protocol.lights_error(six, []))
+    assert measures.lights_error(six, lights(0, 10, 20, 30, 40, 180)) == pytest.approx(0, abs=1e-5)
+    assert math.isnan(measures.lights_error([], six)) and math.isnan(measures.lights_error(six, []))
 
 
 def test_irradiance_in_stops_on_six_planes():
-    assert protocol.irradiance_error(constant(2), constant()) == pytest.approx([1] * 6)
+    assert measures.irradiance_error(constant(2), constant()) == pytest.approx([1] * 6)
     sky = constant(1, 129, 64)
     sky[:64] = 3  # the upper half, without the horizon: a vertical plane receives 2 of 1
     expected = [1, 1, math.log2(3), 0, 1, 1]
-    assert protocol.irradiance_error(sky, constant(1, 129, 64)) == pytest.approx(expected, abs=0.02)
+    assert measures.irradiance_error(sky, constant(1, 129, 64)) == pytest.approx(expected, abs=0.02)
     black = constant(0)
-    assert (protocol.irradiance_error(black, black) == 0).all()
-    assert (protocol.irradiance_error(black, constant()) == -math.inf).all()
+    assert (measures.irradiance_error(black, black) == 0).all()
+    assert (measures.irradiance_error(black, constant()) == -math.inf).all()
 
 
 # ---- Pictures ----------------------------------------------------------------------------------------------

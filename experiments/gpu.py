@@ -1,6 +1,6 @@
 """What a GPU does beside the CPU of the same machine: ``experiments/gpu.sh OUT.json``.
 
-Five steps, for the variant first and then for ``llvm_ad_rgb``, each ended when the time is over:
+Five steps, for ``cuda_ad_rgb`` first and then for ``llvm_ad_rgb``, in at most 8 minutes:
 
 - ``doctor``: the self test of ``envedit doctor``.
 - ``quickstart``: ``envedit run quickstart``, with T not from disk.
@@ -10,12 +10,11 @@ Five steps, for the variant first and then for ``llvm_ad_rgb``, each ended when 
 - ``fit``: the paper's R-SIREN at its size, 256x128 texels, after three epochs that compile its kernels; on
   the CPU a thirtieth of the epochs.
 
-``--small`` makes all of it tiny, to test this program. Needs no data: the map is the analytic sky.
+Needs no data: the map is the analytic sky.
 """
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import json
 import os
@@ -30,14 +29,15 @@ from typing import Any
 
 from envedit.core.atomic_files import write_atomically
 
-CPU = "llvm_ad_rgb"
+GPU, CPU = "cuda_ad_rgb", "llvm_ad_rgb"
+MINUTES = 8
 EPOCHS, CPU_EPOCHS = 1500, 50
 """Of the paper's fit, and how many of them are measured on the CPU."""
 STEPS = ("doctor", "quickstart", "engine", "solver", "fit")
 
 
-def commands(step: str, variant: str, small: bool, folder: str) -> list[list[str]]:
-    """Return the commands of a step, one after the other; the last one is measured."""
+def commands(step: str, variant: str, folder: str, small: bool) -> list[list[str]]:
+    """Return the commands of a step, one after the other; the last one is measured, the others warm up."""
     python = [sys.executable, "-m"]
     variable = ["--set", f"variant={variant}"]
     run = [*python, "envedit", "run", "--json", "--quiet", "--out", folder, *variable]
@@ -88,12 +88,14 @@ def called(command: list[str], left: float) -> tuple[int | None, str, str]:
     return child.returncode, printed, errors
 
 
-def measured(step: str, variant: str, small: bool, left: float) -> dict[str, Any]:
-    """Carry out a step; a failure is an ``error`` among what was measured."""
+def measured(step: str, variant: str, left: float, small: bool = False) -> dict[str, Any]:
+    """Carry out a step within seconds; a failure is an ``error`` among what was measured.
+
+    ``small``: at tiny sizes, to test this program.
+    """
     end = time.monotonic() + left
     with tempfile.TemporaryDirectory() as folder:
-        # A first command only warms up, which tiny sizes do without.
-        for command in commands(step, variant, small, folder)[-1 if small else 0 :]:
+        for command in commands(step, variant, folder, small):
             begun = time.perf_counter()
             code, printed, errors = called(command, end - time.monotonic())
             if code is None:
@@ -114,25 +116,23 @@ def machine() -> dict[str, Any]:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run the command line; returns the exit code: 0, 1 if a step of the variant failed."""
-    parser = argparse.ArgumentParser(prog="experiments/gpu.sh", description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("out", type=Path, metavar="OUT.json", help="where results go, after every step")
-    parser.add_argument("--variant", default="cuda_ad_rgb", help="Mitsuba variant (%(default)s)")
-    parser.add_argument("--minutes", type=float, default=8.0, help="at most (%(default)s)")
-    parser.add_argument("--small", action="store_true", help="tiny sizes, to test this program")
-    parser.add_argument("--steps", nargs="+", choices=STEPS, default=STEPS, metavar="STEP", help="these")
-    given = parser.parse_args(argv)
-    end = time.monotonic() + 60 * given.minutes
-    steps: dict[str, dict[str, Any]] = {step: {} for step in given.steps}
-    found = {"machine": machine(), "minutes": given.minutes, "small": given.small, "steps": steps}
+    """Measure, and write a file after every step; returns the exit code: 0, 1 if a step of the GPU failed."""
+    given = sys.argv[1:] if argv is None else argv
+    if len(given) != 1:
+        print("usage: experiments/gpu.sh OUT.json", file=sys.stderr)
+        return 2
+    end = time.monotonic() + 60 * MINUTES
+    steps: dict[str, dict[str, Any]] = {step: {} for step in STEPS}
+    found = {"machine": machine(), "minutes": MINUTES, "steps": steps}
     failed = False
-    for variant in dict.fromkeys([given.variant, CPU]):
-        for step in given.steps:
-            if step != "doctor" and "error" in steps.get("doctor", {}).get(variant, {}):
+    for variant in (GPU, CPU):
+        for step in STEPS:
+            if step != "doctor" and "error" in steps["doctor"][variant]:
                 continue
-            one = steps[step][variant] = measured(step, variant, given.small, end - time.monotonic())
-            failed |= "error" in one and variant == given.variant
-            write_atomically(given.out, json.dumps(found, indent=1).encode())
+            one = measured(step, variant, end - time.monotonic())
+            steps[step][variant] = one
+            failed |= "error" in one and variant == GPU
+            write_atomically(Path(given[0]), json.dumps(found, indent=1).encode())
             print(f"{variant} {step}: {one.get('error') or format(one['wall_s'], '.1f') + ' s'}", flush=True)
     return int(failed)
 

@@ -10,6 +10,7 @@ import envedit
 from envedit import config
 from envedit.core import shipped
 from envedit.losses import metrics
+from envedit.scene.scene import Scene
 from envedit.targets.photo import Camera
 
 
@@ -41,6 +42,26 @@ def composed(
     return outline * with_object + (1 - outline) * plate * with_object / np.maximum(without, 1e-6)
 
 
+def scenes_of(
+    scene: str, first: str, inserted: str, folder: Path, width: int, height: int | None = None
+) -> dict[str, Scene]:
+    """Load a scene "without" and "with" what is inserted, and that "alone"; their files go to a folder.
+
+    ``first`` is the beginning of the first thing that is seen in the scene.
+    """
+    texts = {
+        "without": scene,
+        "with": scene.replace("</scene>", inserted),
+        "alone": scene.split(first)[0] + HIDDEN + inserted,
+    }
+    scenes = {}
+    for name, text in texts.items():
+        file = folder / f"{name}.xml"
+        file.write_text(text)
+        scenes[name] = envedit.load_scene(file, width=width, height=height)
+    return scenes
+
+
 class Plate:
     """A photograph without noise, and the scene with and without the ball.
 
@@ -52,13 +73,7 @@ class Plate:
         shapes = shipped.folder()
         scene = (shapes / f"{Path(chosen.file).stem}.xml").read_text()
         scene = scene.replace('value="statue.ply"', f'value="{shapes / "statue.ply"}"')
-        stage = scene.split('<shape type="rectangle"')[0]
-        texts = {"with": scene.replace("</scene>", BALL), "alone": stage + HIDDEN + BALL, "without": scene}
-        self.scenes = {}
-        for name, text in texts.items():
-            file = folder / f"{name}.xml"
-            file.write_text(text)
-            self.scenes[name] = envedit.load_scene(file, width=chosen.width)
+        self.scenes = scenes_of(scene, '<shape type="rectangle"', BALL, folder, chosen.width)
         self.outline = self.scenes["alone"].alpha[..., None]
         self.values, self.true = (camera.shown(self._render(name, true)) for name in ("without", "with"))
 

@@ -17,6 +17,7 @@ import mitsuba as mi
 import numpy as np
 
 import envedit
+from envedit.core.atomic_files import make_folder
 from envedit.core.color import tonemap
 from envedit.core.resampling import fit
 from envedit.images import images
@@ -61,15 +62,11 @@ def main() -> None:
     """Fetch the photographs, edit a studio's light towards each, insert the ball, draw ``sheet.jpg``."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path, help="for photographs, scenes and results")
-    parser.add_argument("--only", choices=SIZES, help="edit this one; the other's results are in the folder")
-    given = parser.parse_args()
-    given.folder.mkdir(parents=True, exist_ok=True)
-    prepare(given.folder)
-    for name in [given.only] if given.only else SIZES:
-        result = edited(name, given.folder)
-        if name == "coffee":
-            insert_ball(result, given.folder)
-    draw(given.folder)
+    folder = make_folder(parser.parse_args().folder)
+    prepare(folder)
+    results = {name: edited(name, folder) for name in SIZES}
+    insert_ball(results["coffee"], folder)
+    draw(folder)
 
 
 def draw(folder: Path) -> None:
@@ -77,11 +74,11 @@ def draw(folder: Path) -> None:
     studio = images.read(puresky.data(STUDIO) / STUDIO)[0]
     rows = []
     for name in SIZES:
+        edited_map = images.read(folder / name / "edited.exr")[0]
         pictures = [images.read_stored(folder / name / "photograph.png")[0] / 255]
-        pictures += [
-            tonemap(one / 4, "gamma") for one in (studio, images.read(folder / name / "edited.exr")[0])
-        ]
-        pictures += [images.read_stored(folder / "inserted.png")[0] / 255] if name == "coffee" else []
+        pictures += [tonemap(one / 4, "gamma") for one in (studio, edited_map)]
+        if name == "coffee":
+            pictures.append(images.read_stored(folder / "inserted.png")[0] / 255)
         rows.append([scaled(one) for one in pictures])
     mi.Bitmap(montage(rows)).write(str(folder / "sheet.jpg"), quality=85)
 
@@ -137,16 +134,8 @@ def insert_ball(result: Result, folder: Path) -> None:
     """Write ``inserted.png``: the coffee with the ball, twice as large as the rendering."""
     width, height = 2 * SIZES["coffee"][0], 2 * SIZES["coffee"][1]
     scene = (folder / "coffee.xml").read_text()
-    stage = scene.split('<bsdf type="roughplastic" id="wood">')[0]
-    texts = {
-        "without": scene,
-        "with": scene.replace("</scene>", INSERTED),
-        "alone": stage + insertion.HIDDEN + INSERTED,
-    }
-    scenes = {}
-    for name, text in texts.items():
-        (folder / f"{name}.xml").write_text(text)
-        scenes[name] = envedit.load_scene(folder / f"{name}.xml", width=width, height=height)
+    first = '<bsdf type="roughplastic" id="wood">'
+    scenes = insertion.scenes_of(scene, first, INSERTED, folder, width, height)
     photo = result.photo.laid((height, width))
     without, with_object = (
         scenes[name].render(result.maps["edited"], insertion.SPP) for name in ("without", "with")

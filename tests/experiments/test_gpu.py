@@ -17,8 +17,8 @@ def steps(monkeypatch):
     """Let steps be made up in place of measured; the fixture is their results by step and variant."""
     made = {}
 
-    def measured(step, variant, small, left):
-        assert small and 0 < left <= 480
+    def measured(step, variant, left):
+        assert 0 < left <= 480
         return made.get((step, variant), {"wall_s": 1.0})
 
     monkeypatch.setattr(gpu, "measured", measured)
@@ -28,20 +28,20 @@ def steps(monkeypatch):
 def test_both_variants_are_measured_and_without_a_gpu_the_cpu_alone(tmp_path, steps, capsys):
     out = tmp_path / "gpu.json"
     steps["solver", "llvm_ad_rgb"] = {"error": "slow"}  # the CPU is only there to compare with
-    assert gpu.main([str(out), "--small"]) == 0
+    assert gpu.main([str(out)]) == 0
     found = json.loads(out.read_text())
     assert list(found["steps"]) == ["doctor", "quickstart", "engine", "solver", "fit"]
     assert all(list(one) == ["cuda_ad_rgb", "llvm_ad_rgb"] for one in found["steps"].values())
     assert found["machine"]["cores"] and "cuda_ad_rgb fit: 1.0 s" in capsys.readouterr().out
     steps["doctor", "cuda_ad_rgb"] = {"error": "no GPU"}
-    assert gpu.main([str(tmp_path / "gpu.json"), "--small"]) == 1
-    found = json.loads((tmp_path / "gpu.json").read_text())["steps"]
+    assert gpu.main([str(out)]) == 1
+    found = json.loads(out.read_text())["steps"]
     assert "cuda_ad_rgb" not in found["engine"] and found["engine"]["llvm_ad_rgb"] == {"wall_s": 1.0}
 
 
 @pytest.mark.slow
 def test_a_step_that_fails_is_a_result():
-    found = gpu.measured("doctor", "none_ad_rgb", True, 60)
+    found = gpu.measured("doctor", "none_ad_rgb", 60)
     assert found.keys() == {"error"} and "none_ad_rgb" in found["error"]
 
 
@@ -51,7 +51,7 @@ def test_a_step_ends_with_all_that_it_has_started_when_the_time_is_over(tmp_path
     program.write_text(f"#!/bin/sh\nsleep 60 & echo $! >{tmp_path}/pid\nwait\n")
     program.chmod(0o755)
     monkeypatch.setattr(gpu, "commands", lambda *_: [[str(program)]])
-    assert gpu.measured("fit", "llvm_ad_rgb", True, 2.0) == {"error": "not done after 2 s"}
+    assert gpu.measured("fit", "llvm_ad_rgb", 2.0) == {"error": "not done after 2 s"}
     pid = int((tmp_path / "pid").read_text())
     for _ in range(100):
         try:
@@ -65,16 +65,18 @@ def test_a_step_ends_with_all_that_it_has_started_when_the_time_is_over(tmp_path
 
 
 @pytest.mark.slow
-def test_the_script_measures_at_tiny_sizes(tmp_path):
+def test_steps_are_measured_at_tiny_sizes(tmp_path, monkeypatch):
     """Other tests run what *doctor* and *engine* do, and *quickstart* is as *solver*."""
-    script = ROOT / "experiments/gpu.sh"
-    command = ["bash", script, tmp_path / "gpu.json", "--small", "--steps", "solver", "fit"]
-    command += ["--variant", "llvm_ad_rgb"]
-    own = os.environ | {"PYTHON": sys.executable, "XDG_CACHE_HOME": str(tmp_path / "cache")}
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    solver, fit = (gpu.measured(step, "llvm_ad_rgb", 600, small=True) for step in ("solver", "fit"))
+    assert solver["wall_s"] > 0 and fit["wall_s"] > 0, (solver, fit)
+    assert solver["psnr"]["render"] > solver["psnr"]["initial"]
+    assert fit["epochs"] == 6
+
+
+@pytest.mark.slow
+def test_the_script_calls_the_program_from_anywhere(tmp_path):
+    command = ["bash", ROOT / "experiments/gpu.sh"]
+    own = os.environ | {"PYTHON": sys.executable}
     done = subprocess.run(command, env=own, cwd=tmp_path, capture_output=True, text=True)
-    assert done.returncode == 0, done.stdout + done.stderr
-    steps = json.loads((tmp_path / "gpu.json").read_text())["steps"]
-    found = {step: one["llvm_ad_rgb"] for step, one in steps.items()}
-    assert all(one["wall_s"] > 0 for one in found.values()), found
-    assert found["solver"]["psnr"]["render"] > found["solver"]["psnr"]["initial"]
-    assert found["fit"]["epochs"] == 6
+    assert done.returncode == 2 and "usage: experiments/gpu.sh OUT.json" in done.stderr

@@ -49,6 +49,18 @@ def others() -> dict[str, Path]:
     return {path.stem.removesuffix("_1k"): path for path in sorted(folder.glob("*_1k.hdr"))}
 
 
+def scene(name: str) -> dict:
+    """Return what ``[scene]`` is for a shipped scene, or for one of ENVEDIT_DATA.
+
+    Under most skies the picture of matpreview would be white with the scene's own factor of the map, 3.
+    """
+    if name == "matpreview":
+        return {"file": str(data() / "scenes" / "matpreview" / "matpreview.xml"), "scale": 0.5}
+    if name == "mesh":
+        return {"file": "mesh", "parameters": {"mesh": str(data() / "meshes" / "spot.obj")}}
+    return {"file": name}
+
+
 def file(name: str) -> str:
     """Return the file of a map of ENVEDIT_DATA; ConfigError if there is none of this name."""
     found = find()

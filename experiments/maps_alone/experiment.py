@@ -38,13 +38,12 @@ COMMANDS = {
 
 
 def cases(given):
-    folder = puresky.data()
     files = [puresky.file(name) for name in ("kloofendal_48d_partly_cloudy", "evening_road_01")]
-    files.append(str(folder / "hdri" / "studio_small_03_1k.hdr"))
+    files.append(str(puresky.data() / "hdri" / "studio_small_03_1k.hdr"))
     found = []
     for name, line in COMMANDS.items():
-        for k, file in enumerate(files if "{" in line.replace("{width}", "") else files[:1]):
-            found.append(case(name, line, file, files[k - 1], None))
+        some = files[:1] if name == "sky" else files
+        found += [case(name, line, file, files[k - 1], None) for k, file in enumerate(some)]
         found.append(case(name, line, files[0], files[1], LARGE))
     return found
 

@@ -3,7 +3,6 @@
 import tomllib
 from pathlib import Path
 
-from envedit.core.color import tonemap
 from experiments import puresky
 from experiments.harness import Experiment, calling
 from experiments.paint import figure10
@@ -18,13 +17,6 @@ def cases(given):
         about = {"edit": name.replace("_", " "), "scene": edit["scene"], "map": edit["map"]}
         made.append(calling(name, figure10.edit, tables, about, strokes=edit["strokes"]))
     return made
-
-
-def panels(done):
-    """Return rendering before, painted and saved, and the map before and after."""
-    saved = type(done)(done.case, done.folder / "work/edit_out")
-    shown = [saved.picture(f"render_{name}") for name in ("initial", "target", "edited")]
-    return [tonemap(one, "gamma") for one in (*shown, *saved.maps[:2])]
 
 
 EXPERIMENT = Experiment(
@@ -50,7 +42,7 @@ EXPERIMENT = Experiment(
             "saved from shown, at most": "{differs.max:.4f}",
         },
     ),
-    panels=panels,
+    panels=figure10.saved_panels,
     sheet=lambda case: "artists.jpg",
     alone=True,
 )

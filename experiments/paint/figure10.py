@@ -218,14 +218,19 @@ def cases(given):
     return [*found, page]
 
 
-def panels(done: Done):
-    """Return rendering before, painted and saved, and the upper halves of the map before and after."""
-    if done.case.name == "page":
-        return [images.read_stored(str(done.folder / "page.png"))[0][..., :3] / 255]
+def saved_panels(done: Done) -> list[np.ndarray]:
+    """Return rendering before, painted and saved, and the map before and after."""
     saved = Done(done.case, done.folder / "work/edit_out")
     shown = [saved.picture(f"render_{name}") for name in ("initial", "target", "edited")]
-    shown.append(np.concatenate([one[: len(one) // 2] for one in saved.maps[:2]]))
-    return [tonemap(one, "gamma") for one in shown]
+    return [tonemap(one, "gamma") for one in (*shown, *saved.maps[:2])]
+
+
+def panels(done: Done) -> list[np.ndarray]:
+    """Return those of an edit with the upper halves of both maps in one; or the picture of the page."""
+    if done.case.name == "page":
+        return [images.read_stored(str(done.folder / "page.png"))[0][..., :3] / 255]
+    *renderings, before, after = saved_panels(done)
+    return [*renderings, np.concatenate([one[: len(one) // 2] for one in (before, after)])]
 
 
 EXPERIMENT = Experiment(

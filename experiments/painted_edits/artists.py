@@ -29,10 +29,8 @@ MAPS = (
 SHADOWLESS = ("mud_road", "evening_road_01")
 """Maps whose suns cast no shadow that is to be seen."""
 WIDTH, MAP_WIDTH = 128, 256
-MATPREVIEW_SCALE = 0.5
-"""Factor of the map in place of the scene's own, 3, by which its picture is white under most skies."""
-MATPREVIEW_TURN = 60.0
-"""Degrees by which its maps are turned: their suns are behind its camera, and cast no shadow that is seen."""
+TURNS = {"matpreview": {"rotate_degrees": 60.0}}
+"""By how much the maps of a scene are turned: else their suns are behind its camera, and their shadows."""
 EXPLAINED = 0.75
 """Share of the paint from which on lights explain it."""
 SUN = 0.25
@@ -48,26 +46,17 @@ def options(parser):
 
 
 def cases(args):
-    data = puresky.data()
     skies = puresky.find() if not args.rooms else {}
     maps = puresky.others() if args.rooms else {name: skies[name] for name in MAPS if name in skies}
-    files = {
-        "matpreview": {
-            "file": str(data / "scenes" / "matpreview" / "matpreview.xml"),
-            "scale": MATPREVIEW_SCALE,
-        },
-        "mesh": {"file": "mesh", "parameters": {"mesh": str(data / "meshes" / "spot.obj")}},
-    }
-    turns = {"matpreview": {"rotate_degrees": MATPREVIEW_TURN}}
     made = []
     for edit, scene, name in itertools.product(PAINTERS, SCENES, maps):
         if name in SHADOWLESS and edit in SHADOWS:
             continue
         tables = {
-            "input": {"envmap": str(maps[name]), "width": MAP_WIDTH, **turns.get(scene, {})},
-            "scene": {"width": WIDTH, **files.get(scene, {"file": scene})},
+            "input": {"envmap": str(maps[name]), "width": MAP_WIDTH, **TURNS.get(scene, {})},
+            "scene": puresky.scene(scene) | {"width": WIDTH},
         }
-        about = {"edit": edit, "scene": scene, "map": name}
+        about = {"edit": edit, "scene": scene, "map": name, "kept": " (kept out)" if name in KEPT else ""}
         made.append(calling(f"{edit}-{scene}-{name}".replace(" ", "_"), carry_out, tables, about, edit=edit))
     made = [case for case in made if not args.only or any(text in case.name for text in args.only)]
     return made if args.count is None else evenly(made, args.count, list(maps))
@@ -108,24 +97,18 @@ def carry_out(settings, folder, edit: str) -> dict:
     if paint.sun is not None and lights:
         brightest = np.array(lights[int(np.argmax(flux))]["direction"])
         off = float(degrees(brightest, scene.to_world @ paint.sun))
+    explained = one_light.share(settings, view, initial, paint)
+    towards = result.metrics["painted"]["towards"]
     return {
         **result.metrics,
         **result.metrics["painted"],
         **result.metrics["natural"],
-        "one_light": one_light.share(settings, view, initial, paint),
+        "one_light": explained,
+        "of_explained": towards if explained >= EXPLAINED else None,
         "explanation": explanation(result.notes),
         "sun_off": off,
         "suns": sum(f >= SUN * max(flux) for f in flux),
     }
-
-
-def measure(done: Done) -> list[dict]:
-    """Return the row of a case; none where there was nothing to paint on."""
-    if not done.metrics:
-        return []
-    kept = " (kept out)" if done.case.about["map"] in KEPT else ""
-    explained = done.metrics["one_light"] >= EXPLAINED
-    return [{"kept": kept, "of_explained": done.metrics["towards"] if explained else None, **done.metrics}]
 
 
 def panels(done: Done):
@@ -140,8 +123,7 @@ def panels(done: Done):
 
 EXPERIMENT = Experiment(
     cases,
-    measure,
-    {
+    columns={
         "edit": "{edit}",
         "scene": "{scene}",
         "map": "{map}{kept}",

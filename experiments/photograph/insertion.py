@@ -43,11 +43,11 @@ def composed(
 
 
 def scenes_of(
-    scene: str, first: str, inserted: str, folder: Path, width: int, height: int | None = None
+    scene: str, first: str, inserted: str, folder: Path, width: int, height: int = 0
 ) -> dict[str, Scene]:
     """Load a scene "without" and "with" what is inserted, and that "alone"; their files go to a folder.
 
-    ``first`` is the beginning of the first thing that is seen in the scene.
+    ``first`` is the beginning of the first thing that is seen in the scene; 0: the film's aspect ratio.
     """
     texts = {
         "without": scene,

@@ -39,8 +39,6 @@ PAIRS = (
 )
 """Map and target."""
 WIDTH, MAP_WIDTH = 128, 256
-MATPREVIEW_SCALE = 0.5
-"""Factor of the map in place of the scene's own, 3, by which its picture is white under most skies."""
 PNG_SPP, PNG_SEED = 512, 4711
 """Samples a pixel, and seed, of the PNG."""
 WAYS = {"by_map": "map", "by_picture": "linear picture", "by_png": "PNG"}
@@ -52,9 +50,7 @@ def options(parser):
 
 
 def cases(given):
-    maps, data = puresky.find(), puresky.data()
-    matpreview = data / "scenes" / "matpreview" / "matpreview.xml"
-    files = {"matpreview": {"file": str(matpreview), "scale": MATPREVIEW_SCALE}}
+    maps = puresky.find()
     targets = [(name, f"turned by {turn}", {"rotate_degrees": float(turn)}) for name, turn in TURNS.items()]
     targets += [(name, other, {"file": str(maps[other])}) for name, other in PAIRS if other in maps]
     found = []
@@ -63,7 +59,7 @@ def cases(given):
             continue
         tables = {
             "input": {"envmap": str(maps[name]), "width": MAP_WIDTH},
-            "scene": {"width": WIDTH, **files.get(scene, {"file": scene})},
+            "scene": puresky.scene(scene) | {"width": WIDTH},
             "target": target,
         }
         kind = "turned" if "rotate_degrees" in target else "another map"

@@ -4,7 +4,7 @@ The photographs are path traced under another map than the one that is edited (:
 """
 
 import itertools
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from experiments.harness import Done, Experiment, calling
 from experiments.light_estimation import protocol
 from experiments.measures import brightest, irradiance_error, peak_error
 from experiments.photograph.adam import edited_by_adam
-from experiments.photograph.cameras import CAMERAS, photograph
+from experiments.photograph.cameras import CAMERAS, Model, photograph
 from experiments.photograph.insertion import Plate
 from experiments.summary import Summary
 
@@ -36,13 +36,27 @@ WORSE = "sun", "irradiance", "insertion RMSE"
 PREVIEW_SPP = 64
 SEED = 260_000
 """Of the photographs; that of a case adds its number."""
-LINEAR, KNOWN, ADAM = "linear", "filmic, +1 stops, 5500 K, both given", "Adam on path, sRGB"
-"""Ways beside the cameras: the picture without one; a camera whose exposure and white balance are given;
-Mitsuba's path tracer and Adam, on the first camera's."""
-OF_WAY = {KNOWN: 2, ADAM: 0}
-"""The number of their camera."""
-NAMES = {KNOWN: "known", ADAM: "adam"}
-"""What the names of their cases say."""
+
+
+@dataclass(frozen=True)
+class Way:
+    """How the light of the other map is given."""
+
+    label: str  # in the tables
+    camera: Model | None  # None: by the rendering itself
+    every: int = 0  # one in so many pairs of map and scene is of the part; 0: a pair takes one camera in turn
+
+
+WAYS = {
+    "linear": Way("linear", None, every=6),
+    **{
+        str(k): Way(f"{model.curve}, {model.stops:+g} stops, {model.kelvin:g} K", model)
+        for k, model in enumerate(CAMERAS)
+    },
+    "known": Way("filmic, +1 stops, 5500 K, both given", CAMERAS[2], every=9),
+    "adam": Way("Adam on path, sRGB", CAMERAS[0], every=9),
+}
+"""By name. "known": exposure and white balance are given; "adam": Mitsuba's path tracer and Adam."""
 
 
 def options(parser):
@@ -58,8 +72,7 @@ def cases(given):
     made = []
     for i, name in enumerate(names):
         other = names[(i + FARTHER) % len(names)]
-        ways = [LINEAR, *range(len(CAMERAS)), KNOWN, ADAM]
-        for k, (scene, way) in enumerate(itertools.product(SCENES, ways)):
+        for k, (scene, way) in enumerate(itertools.product(SCENES, WAYS)):
             if given.maps and name not in given.maps:
                 continue
             if given.part and not _in_part(i, SCENES.index(scene), way):
@@ -70,20 +83,18 @@ def cases(given):
                 "scene": {"file": scene},
                 "output": {"spp": PREVIEW_SPP},
             }
-            camera = CAMERAS[way] if isinstance(way, int) else None
-            label = f"{camera.curve}, {camera.stops:+g} stops, {camera.kelvin:g} K" if camera else way
-            about = {"scene": scene, "map": name, "other": other, "camera": label}
-            title = f"{scene}-{name}-{other}-{NAMES.get(way, way)}"
-            how = {"other": str(maps[other]), "way": way, "seed": SEED + 100 * i + k}
-            made.append(calling(title, edited, tables, about, **how))
-    return sorted(made, key=lambda case: case.about["camera"] in (LINEAR, KNOWN, ADAM))
+            about = {"scene": scene, "map": name, "other": other, "way": way}
+            title = f"{scene}-{name}-{other}-{way}"
+            seed = SEED + 100 * i + k
+            made.append(calling(title, edited, tables, about, other=str(maps[other]), way=way, seed=seed))
+    return sorted(made, key=lambda case: WAYS[case.about["way"]].every > 0)
 
 
 def _in_part(i, j, way):
     """Say whether a way of the i-th map and j-th scene belongs to the part: each pair takes one camera."""
-    if isinstance(way, int):
-        return way == (len(SCENES) * i + j) % len(CAMERAS)
-    return (i + j) % {LINEAR: 6, KNOWN: 9, ADAM: 9}[way] == 0
+    if every := WAYS[way].every:
+        return (i + j) % every == 0
+    return int(way) == (len(SCENES) * i + j) % len(CAMERAS)
 
 
 def edited(settings, folder, other, way, seed) -> dict:
@@ -92,21 +103,21 @@ def edited(settings, folder, other, way, seed) -> dict:
     true, _ = images.load_envmap(other, settings.input.width, False)
     unedited, _ = images.load_envmap(settings.input.envmap, settings.input.width, False)
     camera, summary, curve = Camera("srgb"), "", "srgb"
-    if way == LINEAR:
+    model = WAYS[way].camera
+    if model is None:
         file = folder / "picture.exr"
         scene = envedit.load_scene(settings.scene.file, width=settings.scene.width)
         images.write_exr(file, scene.render(true, 256, seed), panorama=False)
         target = config.Target(kind="rendering", file=str(file))
     else:
         file = folder / "photograph.jpg"
-        model = CAMERAS[OF_WAY.get(way, way)]
         camera = photograph(model, settings.scene, true, seed, file)
         target = config.Target(kind="photo", file=str(file))
-        if way == KNOWN:
+        if way == "known":
             target = replace(target, exposure=camera.stops, white_balance=model.kelvin)
 
     # ---- The edit
-    if way == ADAM:
+    if way == "adam":
         found, seconds = edited_by_adam(settings, unedited, file)
         psnr = None
     else:
@@ -155,12 +166,12 @@ def measured(envmap, true) -> dict:
 
 
 def measure(done: Done) -> list[dict]:
-    kind = done.case.about["camera"]
+    way = WAYS[done.case.about["way"]]
     edited, unedited = done.metrics["edited"], done.metrics["unedited"]
     sun = edited["sun"] if done.metrics["sunlit"] > SUNLIT else None
     worse = [name for name in WORSE if edited[name] > unedited[name]]
-    rows = [{"kind": kind, "shown sun": sun, "worse": ", ".join(worse), **edited}]
-    if kind not in (LINEAR, KNOWN, ADAM):
+    rows = [{"kind": way.label, "shown sun": sun, "worse": ", ".join(worse), **edited}]
+    if not way.every:
         sun = unedited["sun"] if sun is not None else None
         rows.append({"kind": "unedited", "shown sun": sun, "worse": "", "found": "", **unedited})
         rows.append(rows[0] | {"kind": "all cameras"})

@@ -11,8 +11,9 @@ from envedit.core.color import luminance
 from envedit.representations.layers import unclip
 from envedit.representations.layers.clipped_light import RING_DEGREES
 from experiments import puresky
-from experiments.harness import Experiment, calling, markdown
+from experiments.harness import Experiment, calling
 from experiments.measures import degrees
+from experiments.summary import Summary
 from experiments.unclip import clipping
 
 CLEAR = ("autumn_field", "kloofendal_48d_partly_cloudy", "sunflowers")
@@ -20,7 +21,7 @@ LOW = ("industrial_sunset", "wasteland_clouds")
 
 
 def measure_sun(settings, folder, file: str, map_name: str) -> dict:
-    """Return log2 of aureole over flux (1/sr), of flux over sky, and of that over the analytic model's."""
+    """Return log2 of aureole over flux (1/sr), of flux over sky, of the analytic one, and of their ratio."""
     radiance = clipping.load(file)
     true = clipping.truth(radiance, map_name)
     directions = latlong.directions(*radiance.shape[:2])
@@ -33,12 +34,8 @@ def measure_sun(settings, folder, file: str, map_name: str) -> dict:
     elevation = float(np.degrees(np.arcsin(true.direction[1])))
     sun, sky = unclip.analytic_fluxes(elevation)
     ratio = float(np.log2(true.flux / true.sky))
-    return {
-        "elevation": elevation,
-        "aureole": aureole,
-        "ratio": ratio,
-        "offset": ratio - float(np.log2(luminance(sun) / luminance(sky))),
-    }
+    analytic = float(np.log2(luminance(sun) / luminance(sky)))
+    return {"aureole": aureole, "ratio": ratio, "analytic": analytic, "offset": ratio - analytic}
 
 
 def cases(args):
@@ -48,58 +45,57 @@ def cases(args):
     ]
 
 
-def summary(rows) -> str:
-    """Return the constants, and the errors of each map by those without it, by first ring."""
-    suns = {row["map"]: row for row in rows}
+def constants(suns: list[dict]) -> tuple[np.ndarray, float, tuple[float, float]]:
+    """Return AUREOLE, HAZE_STOPS and SKY_OFFSET of some suns."""
+    clear = [sun for sun in suns if sun["map"] in CLEAR]
+    low = [sun for sun in suns if sun["map"] in LOW]
+    aureole = np.mean([sun["aureole"] for sun in clear], axis=0)
+    haze = float(np.mean([sun["aureole"] - aureole for sun in low]))
+    clear_offset, low_offset = (float(np.mean([sun["offset"] for sun in some])) for some in (clear, low))
+    return aureole, haze, (clear_offset, low_offset)
+
+
+def errors(suns: list[dict], sun: dict) -> list[dict]:
+    """Return the errors of both estimates and of their mean by the constants of the other suns, stops.
+
+    A row for each ring that may be the first outside the clipped region.
+    """
+    aureole, haze, offsets = constants([one for one in suns if one is not sun])
+    low = sun["map"] in LOW
+    rows = []
+    for ring, radius in enumerate(RING_DEGREES[: len(aureole)]):
+        near = radius <= unclip.NEAR_DEGREES
+        by_aureole = sun["aureole"][ring] - aureole[ring] - haze * low
+        by_sky = offsets[low] - sun["offset"]
+        precision = np.array([unclip.AUREOLE_STOPS[not near], unclip.SKY_STOPS]) ** -2.0
+        rows.append(
+            {
+                "suns": "low" if low else "clear, near" if near else "clear, far",
+                "aureole": by_aureole,
+                "sky": by_sky,
+                "both": np.average([by_aureole, by_sky], weights=precision),
+            }
+        )
+    return rows
+
+
+def summary(suns: list[dict]) -> str:
+    """Return the constants, and the errors of each map by those without it."""
     if len(suns) < len(CLEAR + LOW):
         return f"{len(suns)} of {len(CLEAR + LOW)} suns are measured"
-    aureole, haze, offsets = _constants(suns, "")
-    tables = [np.round(values, 2).tolist() for values in (aureole, offsets)]
-    lines = [f"AUREOLE {tables[0]}, HAZE_STOPS {haze:.1f}, SKY_OFFSET {tables[1]}"]
-
-    # ---- Every map by the constants of the others
-    errors = {name: _errors(suns, name) for name in suns}
-    rows = []
-    for ring, radius in enumerate(RING_DEGREES[: len(unclip.AUREOLE)]):
-        some = [errors[name][:, ring] for name in CLEAR + LOW]
-        rows.append([f"{radius:.1f}", *(" ".join(f"{e:+.1f}" for e in one) for one in some)])
-    head = ["first ring, degrees", *(f"{name}: aureole, sky, both" for name in CLEAR + LOW)]
-    lines.append(markdown(head, rows))
-    near = RING_DEGREES[: len(unclip.AUREOLE)] <= unclip.NEAR_DEGREES
-    for label, names, rings in (
-        ("clear, near", CLEAR, near),
-        ("clear, far", CLEAR, ~near),
-        ("low", LOW, near | ~near),
-    ):
-        spread = np.sqrt(np.mean([np.square(errors[name][:, rings]).mean(axis=1) for name in names], axis=0))
-        lines.append(
-            f"{label}: RMS of aureole {spread[0]:.2f}, sky {spread[1]:.2f}, both {spread[2]:.2f} stops"
-        )
-    return "\n\n".join(lines)
+    aureole, haze, offsets = constants(suns)
+    rounded = f"AUREOLE {np.round(aureole, 2).tolist()}, HAZE_STOPS {haze:.1f}"
+    rounded += f", SKY_OFFSET {np.round(offsets, 2).tolist()}"
+    return f"{rounded}\n\n{ERRORS([row for sun in suns for row in errors(suns, sun)])}"
 
 
-def _constants(suns, left_out):
-    """Return AUREOLE, HAZE_STOPS and SKY_OFFSET without a map."""
-    clear = [suns[name] for name in CLEAR if name != left_out]
-    low = [suns[name] for name in LOW if name != left_out]
-    aureole = np.mean([one["aureole"] for one in clear], axis=0)
-    haze = float(np.mean([np.mean(one["aureole"] - aureole) for one in low]))
-    return aureole, haze, [float(np.mean([one["offset"] for one in some])) for some in (clear, low)]
+ERRORS = Summary(
+    {"RMS of the errors, stops": "{suns}"},
+    {"by the aureole": "{aureole.rms:.2f}", "by the sky": "{sky.rms:.2f}", "both": "{both.rms:.2f}"},
+)
 
-
-def _errors(suns, name):
-    """Return the errors (3, rings) of both estimates and their mean for a map, in stops."""
-    aureole, haze, offsets = _constants(suns, name)
-    sun = suns[name]
-    low = name in LOW
-    by_aureole = np.array(sun["aureole"]) - aureole - haze * low
-    by_sky = np.full_like(by_aureole, offsets[low] - sun["offset"])
-    near = RING_DEGREES[: len(aureole)] <= unclip.NEAR_DEGREES
-    precision = (
-        np.stack([np.where(near, *unclip.AUREOLE_STOPS), np.full(len(aureole), unclip.SKY_STOPS)]) ** -2.0
-    )
-    both = (precision * [by_aureole, by_sky]).sum(axis=0) / precision.sum(axis=0)
-    return np.stack([by_aureole, by_sky, both])
-
-
-EXPERIMENT = Experiment(cases, summary=summary)
+EXPERIMENT = Experiment(
+    cases,
+    columns={"map": "{map}", "flux over sky, stops": "{ratio:+.1f}", "analytic": "{analytic:+.1f}"},
+    summary=summary,
+)

@@ -79,6 +79,7 @@ def measure_map(settings, folder, file: str, map_name: str) -> list[dict]:
 
 def cases(args):
     maps = [(name, file, GROUPS[name in clipping.KEPT]) for name, file in puresky.find().items()]
+    maps.sort(key=lambda one: GROUPS.index(one[2]))
     maps += [(name, file, GROUPS[2]) for name, file in puresky.others().items()]
     return [
         calling(name, measure_map, {}, {"map": name, "set": of}, file=str(file), map_name=name)
@@ -86,34 +87,15 @@ def cases(args):
     ]
 
 
-def summary(rows) -> str:
-    """Return, for every set of maps and clipping, the errors over sunny maps and what was taken for what."""
-    ordered = sorted(rows, key=lambda row: (GROUPS.index(row["set"]), clipping.LEVELS.index(row["level"])))
-    parts = [
-        {
-            "sunny": row if row["sunny"] else None,
-            "back": row if row["sunny"] and row["added"] else None,
-            "other": None if row["sunny"] else row,
-        }
-        for row in ordered
-    ]
-    return STATISTICS([row | part for row, part in zip(ordered, parts, strict=True)])
-
-
-STATISTICS = Summary(
-    {"maps": "{set}", "clipped at": "{level}"},
-    {
-        "sunny: sun found": "{back[true_contrast].count} of {sunny[true_contrast].count}",
-        "flux, stops: clipped": "{sunny[clipped_flux].mean:+.1f}",
-        "RMS with the sun back (worst)": "{back[flux].rms:.1f} ({back[flux].worst:+.1f})",
-        "irradiance, stops: clipped": "{sunny[clipped_irradiance].mean:+.2f}",
-        "RMS with the sun back": "{back[irradiance].rms:.2f}",
-        "shadow: truth": "{sunny[true_contrast].mean:.2f}",
-        "clipped": "{sunny[clipped_contrast].mean:.2f}",
-        "with the sun back": "{sunny[contrast].mean:.2f}",
-        "not sunny: false suns": "{other[false].above[0]} of {other[false].count}",
-    },
-)
+def measure(done) -> list[dict]:
+    """Return the rows of a map; each also has itself as ``sun``, as ``sun`` and ``back``, or as ``other``."""
+    rows = []
+    for row in done.metrics:
+        sun = row if row["sunny"] else None
+        back = sun if row["added"] else None
+        other = None if row["sunny"] else row
+        rows.append({**row, "sun": sun, "back": back, "other": other})
+    return rows
 
 
 def panels(done):
@@ -126,21 +108,35 @@ def panels(done):
 
 EXPERIMENT = Experiment(
     cases,
-    columns={
+    measure,
+    {
         "map": "{map}",
         "clipped at": "{level}",
         "called": "{kind}",
         "sun added": lambda row: ("false" if row["false"] else "yes") if row["added"] else "",
         "off, degrees": "{off:.1f}",
         "true sun over sky, stops": "{true_ratio:+.1f}",
-        "flux, stops: clipped": lambda row: f"{row['clipped_flux']:+.1f}" if row["sunny"] else "",
-        "now": lambda row: f"{row['flux']:+.1f}" if row["sunny"] else "",
-        "expected": lambda row: f"{row['spread']:.1f}" if row["sunny"] else "",
+        "flux, stops: clipped": "{sun[clipped_flux]:+.1f}",
+        "now": "{sun[flux]:+.1f}",
+        "expected": "{sun[spread]:.1f}",
         "irradiance, stops: clipped": "{clipped_irradiance:+.2f}",
         "now ": "{irradiance:+.2f}",
         "shadow: truth, clipped, now": "{true_contrast:.2f} {clipped_contrast:.2f} {contrast:.2f}",
     },
     group=lambda row: f"{row['set']}, {'sunny' if row['sunny'] else 'not sunny'}",
-    summary=summary,
+    summary=Summary(
+        {"maps": "{set}", "clipped at": "{level}"},
+        {
+            "sunny: sun found": "{back[true_contrast].count} of {sun[true_contrast].count}",
+            "flux, stops: clipped": "{sun[clipped_flux].mean:+.1f}",
+            "RMS with the sun back (worst)": "{back[flux].rms:.1f} ({back[flux].worst:+.1f})",
+            "irradiance, stops: clipped": "{sun[clipped_irradiance].mean:+.2f}",
+            "RMS with the sun back": "{back[irradiance].rms:.2f}",
+            "shadow: truth": "{sun[true_contrast].mean:.2f}",
+            "clipped": "{sun[clipped_contrast].mean:.2f}",
+            "with the sun back": "{sun[contrast].mean:.2f}",
+            "not sunny: false suns": "{other[false].above[0]} of {other[false].count}",
+        },
+    ),
     panels=panels,
 )

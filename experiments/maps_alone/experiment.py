@@ -10,6 +10,7 @@ import numpy as np
 
 import envedit
 from envedit.core import latlong
+from envedit.core.errors import EnveditError
 from envedit.images import images
 from experiments import puresky
 from experiments.harness import Done, Experiment, calling
@@ -21,8 +22,6 @@ LARGE = 8192
 CLIPPED_AT = 10.0
 """Radiance at which a map is clipped for ``unclip``."""
 LOOK = Path(__file__).parents[1] / "looks" / "evening.toml"
-MOST_GB = 3.0
-"""Peak memory that a command may have on it."""
 COMMANDS = {
     "lights": "lights {first}",
     "adjust, rotation and colour": "adjust {first} --horizon 5 --tilt 3 --exposure 1 --saturation 0.8",
@@ -58,7 +57,7 @@ def case(name, line, first, second, width):
 
 
 def timed(settings, folder: Path, line: str, width: int | None) -> dict:
-    """Run a command in a process of its own; returns exit code and cost, as :func:`.cost.main`."""
+    """Run a command in a process of its own; returns its cost, as :func:`.cost.main`."""
     files = [settings.input.envmap, settings.target.file]
     if width:
         files = [enlarged(file, folder.parent / f"{Path(file).stem}_{width}.exr", width) for file in files]
@@ -72,8 +71,10 @@ def timed(settings, folder: Path, line: str, width: int | None) -> dict:
     environment = os.environ | {"PYTHONPATH": str(Path(envedit.__file__).parents[1])}
     file = folder / "cost.json"
     measuring = [sys.executable, "-S", cost.__file__, str(file), *command]
-    done = subprocess.run(measuring, cwd=folder, env=environment, stdout=subprocess.DEVNULL)
-    return {"exit_code": done.returncode, **json.loads(file.read_text())}
+    code = subprocess.run(measuring, cwd=folder, env=environment, stdout=subprocess.DEVNULL).returncode
+    if code:
+        raise EnveditError(f"envedit {line} ended with exit code {code}; see above in log.txt")
+    return json.loads(file.read_text())
 
 
 def enlarged(file: str, to: Path, width: int) -> str:
@@ -88,15 +89,6 @@ def measure(done: Done) -> dict:
     return done.metrics | {"megabytes": done.metrics["peak_bytes"] / 2**20}
 
 
-def failures(rows: list[dict]) -> list[str]:
-    """Say what failed, or took more memory than it may."""
-    wrong = [
-        f"{row['command']} on {row['map']}: exit code {row['exit_code']}" for row in rows if row["exit_code"]
-    ]
-    large = [row for row in rows if row["megabytes"] > 1024 * MOST_GB]
-    return wrong + [f"{row['command']} on {row['map']}: {row['megabytes']:.0f} MB" for row in large]
-
-
 EXPERIMENT = Experiment(
     cases,
     measure,
@@ -109,6 +101,5 @@ EXPERIMENT = Experiment(
             "peak memory, MB": "{megabytes.max:.0f}",
         },
     ),
-    failures=failures,
     alone=True,
 )

@@ -2,7 +2,6 @@
 
 import argparse
 import re
-from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,7 +13,8 @@ from envedit.core import shipped
 from envedit.core.errors import EnveditError, InputError
 from envedit.core.quiet_libraries import quiet_libraries
 from envedit.scene import parser, scene
-from experiments.harness import Experiment, calling
+from experiments.harness import Done, Experiment, calling
+from experiments.summary import Summary, values
 
 WIDTH, MAP = 64, 128
 """Pixels and texels across."""
@@ -106,16 +106,11 @@ def plain(lit: scene.Scene, settings: config.Config, given: inputs.InputMap, fol
         return [float(np.array(picture)[..., :3].mean(dtype=np.float64)) for picture in pictures]
 
 
-def summary(rows: list[dict]) -> str:
-    loaded = [row for row in rows if not row["refused"]]
-    compared = [row for row in loaded if row["ratio"] == row["ratio"]]  # known
-    near = sum(abs(row["ratio"] - 1) <= max(NEAR, SIGMA * row["noise"]) for row in compared)
-    better = sum(row["psnr"] >= row["initial"] for row in loaded)
-    text = f"{len(loaded)} of {len(rows)} scenes are edited; {near} of {len(compared)} initial renderings "
-    text += f"have Mitsuba's mean to {100 * NEAR:g} % or their noise; {better} of {len(loaded)} edited "
-    text += "renderings are no farther from the target, under the turned map, than the initial one."
-    reasons = Counter(re.sub(r"^.*?: ", "", row["refused"].splitlines()[0]) for row in rows if row["refused"])
-    return "\n".join([text, *(f"- refused, {count}: {why}" for why, count in reasons.most_common())])
+def measure(done: Done) -> dict:
+    """Return the numbers of a scene with how far it is off Mitsuba's, over what counts as the same."""
+    row = values(done.metrics)
+    off = abs(row["ratio"] - 1) / max(NEAR, SIGMA * row["noise"])
+    return {**row, "off": off, "gain": row["psnr"] - row["initial"]}
 
 
 def cell(text: str) -> str:
@@ -124,7 +119,8 @@ def cell(text: str) -> str:
 
 EXPERIMENT = Experiment(
     cases,
-    columns={
+    measure,
+    {
         "scene": "{scene}",
         "refused": lambda m: cell(m["refused"]),
         "light": "{light}",
@@ -134,6 +130,15 @@ EXPERIMENT = Experiment(
         "rendering (unedited), dB": "{psnr:.1f} ({initial:.1f})",
         "map (unedited), dB": "{map:.1f} ({unedited:.1f})",
     },
-    summary=summary,
+    summary=Summary(
+        {},
+        {
+            "scenes": "{runs}",
+            "edited": "{gain.count}",
+            "worse than unedited": "{gain.below[0]}",
+            "initial renderings compared": "{off.count}",
+            "with Mitsuba's mean": "{off.below[1]}",
+        },
+    ),
     options=options,
 )

@@ -6,8 +6,8 @@ import pytest
 
 from envedit import config
 from envedit.core.errors import InputError
+from experiments.harness import Case, Done, rows_of
 from experiments.scenes import experiment
-from experiments.summary import values
 from tests.oracles import users_scenes
 from tests.oracles.builders import BALL, SENSOR, write_scene
 from tests.oracles.users_scenes import CONSTANT, LAMP, MEDIUM, PATH, VOLUME, light
@@ -46,15 +46,18 @@ def test_a_scene_is_compared_with_mitsuba_or_refused(parts, lit_by, refused, tmp
         assert found["ratio"] == pytest.approx(1, abs=0.02) and found["psnr"] == 30 and not found["plain"]
 
 
-def test_scenes_are_counted():
-    rows = [
+def test_scenes_are_counted(tmp_path):
+    results = [
         {"refused": "", "ratio": 1.001, "noise": 0.0, "psnr": 40.0, "initial": 20.0},
         {"refused": "", "ratio": 1.02, "noise": 0.001, "psnr": 19.0, "initial": 20.0},
         {"refused": "", "ratio": 1.02, "noise": 0.01, "psnr": 19.0, "initial": 20.0},
-        {"refused": "", "ratio": None, "psnr": 30.0, "initial": 30.0},
-        {"refused": "a.xml (line 3): no film\nmore", "ratio": None},
-        {"refused": "b.xml (line 9): no film", "ratio": None},
+        {"refused": "", "ratio": None, "noise": None, "psnr": 30.0, "initial": 30.0},
+        {"refused": "a.xml (line 3): no film\nmore"}
+        | dict.fromkeys(("ratio", "noise", "psnr", "initial"), None),
     ]
-    text = experiment.summary([values(row) for row in rows])
-    assert "4 of 6 scenes are edited; 2 of 3 initial" in text and "2 of 4 edited renderings" in text
-    assert "- refused, 2: no film" in text
+    rows = []
+    for result in results:
+        done = Done(Case("x", {}), tmp_path)
+        done.__dict__["metrics"] = result
+        rows += rows_of(experiment.EXPERIMENT, [done])
+    assert experiment.EXPERIMENT.summary(rows).splitlines()[-1] == "| 5 | 4 | 2 | 3 | 2 |"

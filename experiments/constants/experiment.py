@@ -50,12 +50,11 @@ BASE = {
 
 @dataclass(frozen=True)
 class Constant:
-    """A module below ``envedit``, a name there, its number, and the first sentence of its docstring."""
+    """A module below ``envedit``, a name there, and its number."""
 
     module: str
     name: str
     value: float
-    meaning: str
 
     @property
     def label(self) -> str:
@@ -63,7 +62,7 @@ class Constant:
 
 
 def constants() -> list[Constant]:
-    """List the constants of the solver, in the order of modules and lines."""
+    """List the constants of the solver that have a docstring, in the order of modules and lines."""
     found = []
     folder = Path(envedit.__file__).parent
     for file in [folder / "preparation.py", *sorted((folder / "solve").glob("*.py"))]:
@@ -71,12 +70,11 @@ def constants() -> list[Constant]:
         body = ast.parse(file.read_text()).body
         for node, after in zip(body, body[1:], strict=False):
             if isinstance(node, ast.Assign) and isinstance(after, ast.Expr):
-                text = " ".join(ast.literal_eval(after.value).split())
                 targets = node.targets[0]
                 names = [one.id for one in getattr(targets, "elts", [targets])]
                 values = [getattr(importlib.import_module(module), name) for name in names]
                 found += [
-                    Constant(module, name, value, text)
+                    Constant(module, name, value)
                     for name, value in zip(names, values, strict=True)
                     if isinstance(value, int | float) and not isinstance(value, bool)
                 ]
@@ -188,7 +186,6 @@ EXPERIMENT = Experiment(
     columns={
         "constant": lambda row: f"`{row['constant'].label}`",
         "value": lambda row: f"{row['constant'].value:.4g}",
-        "what it is": lambda row: row["constant"].meaning,
         "halved: dB, dB, %": _changes("halved"),
         "doubled: dB, dB, %": _changes("doubled"),
     },

@@ -1,16 +1,13 @@
 """Carry out the six edits of scenes/edits on the analytic sky and on real maps.
 
-The two real maps have their sun where the strokes expect one; without ENVEDIT_DATA only the analytic sky is
-used.
+The two real maps have their sun where the strokes expect one.
 """
 
 import itertools
-import sys
 import tomllib
 from pathlib import Path
 
 from envedit.core.color import tonemap
-from envedit.core.errors import EnveditError
 from envedit.images import images
 from envedit.losses import metrics
 from experiments import puresky
@@ -23,27 +20,11 @@ MAPS = ("sunsky", "kloofendal_48d_partly_cloudy", "sunflowers")
 NOTE = "likeliest explanation of the paint: "
 
 
-def file_of(name: str) -> str | None:
-    """Return what [input] envmap is for a map, None where the data are not there."""
-    if name == "sunsky":
-        return name
-    try:
-        file = puresky.find().get(name)
-    except EnveditError:
-        return None
-    return str(file) if file else None
-
-
-def cases(args):
-    maps = {name: file_of(name) for name in MAPS}
-    for name in [name for name in maps if not maps[name]]:
-        print(f"{name}: skipped, ENVEDIT_DATA has no puresky/{name}_puresky_1k.hdr", file=sys.stderr)
-        maps.pop(name)
+def cases(given):
     made = []
-    for edit, name in itertools.product(EDITS, maps):
+    for edit, name in itertools.product(EDITS, MAPS):
         tables = tomllib.loads((FOLDER / f"{edit}.toml").read_text(encoding="utf-8"))
-        tables.pop("output", None)
-        tables["input"] = tables.get("input", {}) | {"envmap": maps[name]}
+        tables["input"]["envmap"] = name if name == "sunsky" else puresky.file(name)
         made.append(Case(f"{edit}-{name}", tables, {"edit": edit, "map": name}))
     return made
 

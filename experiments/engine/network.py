@@ -17,7 +17,7 @@ import numpy as np
 from envedit.core.errors import ConfigError
 from envedit.representations.siren import network as siren
 
-from .timing import compiled, growth, side_by_side
+from .timing import compiled, side_by_side
 
 MAP = (64, 256)
 """Active texels of a 256x128 map: 16,384 points."""
@@ -29,8 +29,8 @@ def measure(settings, torch: str | None = None, quick: bool = False) -> dict:
     """Measure ``siren.forward`` and ``siren.backward``, in turns with their products alone.
 
     Returns ``siren``: a row with the times of ``forward``, ``step`` and ``own``, the products alone;
-    ``ratio``: median of the step over that; ``kernels`` after warm-up; ``memory`` over 200 steps; ``torch``:
-    times of that interpreter's PyTorch, or None.
+    ``ratio``: median of the step over that; ``kernels`` after warm-up; ``torch``: times of that
+    interpreter's PyTorch, or None.
     """
     hidden, depth, omega = (getattr(settings.representation, key) for key in ("hidden", "depth", "omega"))
     shape = (8, 32) if quick else MAP
@@ -64,7 +64,6 @@ def measure(settings, torch: str | None = None, quick: bool = False) -> dict:
         "ratio": step / taken["own"]["median_s"],
         "gflops": work / step / 1e9,
         "kernels": compiled(both),
-        "memory": growth(both, 20 if quick else 200, 5 if quick else 20),
         "torch": min(peers, key=lambda peer: peer["median_s"], default=None),
     }
     return {"siren": [row | taken]}

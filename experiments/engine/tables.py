@@ -84,7 +84,6 @@ COLUMNS = {
         "PyTorch": lambda r: seconds(r["torch"]["median_s"]),
         "GFLOP/s": "{gflops:.0f}",
         "compiled after warm-up": "{kernels[compiled]} of {kernels[launched]}",
-        "growth of memory": lambda r: f"{si(r['memory']['bytes'], 'B')} in {r['memory']['calls']} steps",
     },
     "transport": SIZE
     | {

@@ -1,4 +1,4 @@
-"""Clocks and counters: seconds of an evaluated result, kernels compiled, memory in use, the machine."""
+"""Clocks and counters: seconds of an evaluated result, kernels compiled, the machine."""
 
 import importlib
 import os
@@ -54,24 +54,6 @@ def compiled(function: Callable, calls: int = 5) -> dict:
         kernels = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
     fresh = sum(not k["cache_hit"] or k["cache_disk"] for k in kernels)
     return {"calls": calls, "launched": len(kernels), "compiled": fresh}
-
-
-def resident_bytes() -> int:
-    """Return the memory that the process occupies now; 0 where the system does not report it."""
-    try:
-        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-    except OSError:
-        return 0
-
-
-def growth(function: Callable, calls: int, settle: int) -> dict:
-    """Measure by how much the process grows over ``calls`` calls, after ``settle`` that do not count."""
-    for _ in range(settle):
-        once(function)
-    before = resident_bytes()
-    for _ in range(calls):
-        once(function)
-    return {"calls": calls, "bytes": resident_bytes() - before}
 
 
 def machine() -> dict:

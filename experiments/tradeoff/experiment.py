@@ -37,7 +37,6 @@ def worth(judged: dict) -> dict:
     """Return how good a map is: dB of the rendering, without the judge's noise, and of the map; its SSIM."""
     return {
         "psnr": min(judged["render"]["psnr_without_noise"], MOST_PSNR),
-        "noisy_psnr": judged["render"]["psnr"],
         "map_psnr": judged["map"]["psnr"],
         "map_ssim": judged["map"]["ssim"],
         "sun": judged["sun_degrees"],
@@ -55,7 +54,6 @@ def costs(run: dict) -> dict:
         "s": cost["wall_s"],
         "again_s": cost["wall_s"] - timing["fit_s"] - timing["transport_s"],
         "gb": cost["peak_bytes"] / 1e9,
-        "processors": cost["cpu_s"] / cost["wall_s"],
     } | {part: sum(timing[key] for key in keys) for part, keys in PARTS.items()}
 
 
@@ -114,10 +112,8 @@ EXPERIMENT = Experiment(
             "rendering s": "{rendering_s:.1f}",
             "tracing and search s": "{tracing_s:.1f}",
             "numbers s": "{numbers_s:.1f}",
-            "processors": "{processors:.2f}",
             "GB": "{gb:.2f}",
             "rendering, dB": "{psnr:.1f}",
-            "with the judge's noise": "{noisy_psnr:.1f}",
             "map, dB": "{map_psnr:.1f}",
             "map SSIM": "{map_ssim:.3f}",
             "sun off, degrees": "{sun:.1f}",

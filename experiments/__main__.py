@@ -24,7 +24,8 @@ def about(module: ModuleType) -> str:
 
 def main(argv=None) -> int:
     """Run an experiment by name; returns the exit code."""
-    given, known = sys.argv[1:] if argv is None else argv, modules()
+    given = sys.argv[1:] if argv is None else argv
+    known = modules()
     if given[:1] in (["-h"], ["--help"]):
         print("python -m experiments NAME run|table|sheet: compute, print the table, draw the sheets\n")
         width = max(map(len, known))

@@ -324,7 +324,8 @@ def _act(name, experiment, given):
     if not chosen:
         got = f"--only {' '.join(given.only)}: " if given.only else ""
         raise ConfigError(f"{got}no case of {name} is left; give other options")
-    cases, missing = [(case, case.job(given.sets)) for case in chosen], []
+    cases = [(case, case.job(given.sets)) for case in chosen]
+    missing = []
     if given.action == "run":
         outcomes = carry_out(cases, out, given, sys.stderr)
         missing = [one for one in outcomes if one.state not in ("done", "skipped")]
@@ -333,7 +334,8 @@ def _act(name, experiment, given):
             return 0
         if missing:
             print(sweep.table(missing), file=sys.stderr)
-    done, to = done_of(cases, out), make_folder(given.to or out)
+    done = done_of(cases, out)
+    to = make_folder(given.to or out)
     if given.action == "sheet":
         draw = experiment.draw
         if not draw and experiment.panels is edit_panels and cases[0][0].result == call.RESULT:

@@ -41,7 +41,8 @@ def data(quick: bool) -> tuple[dict, dict]:
 
 
 def cases(given):
-    quick, found = given.quick, []
+    quick = given.quick
+    found = []
     maps, meshes = data(quick)
     sky = {"envmap": str(maps[SUNNY])} if SUNNY in maps else ANALYTIC
 

@@ -19,7 +19,8 @@ def measure(settings, quick: bool = False) -> dict:
     """
     original, _ = load_map(settings.input)
     rows = active_rows(settings.input.rows, original.shape[0])
-    image, network = original[rows.slice], settings.representation
+    image = original[rows.slice]
+    network = settings.representation
     shape = image.shape[:2]
     fitted = fit.fit(image, network, settings.fit, settings.seed, rows.place)
     x = fit.points(network, shape, rows.place)

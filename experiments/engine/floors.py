@@ -66,7 +66,8 @@ def _read_packets(packed, rows, lanes):
     """Sum packets in the order in which a product with T reads its own, but without reading a map."""
     lane = dr.arange(mi.UInt32, lanes)
     place = (lane // sparse_matrix.SLICE) * (rows * sparse_matrix.SLICE) + lane % sparse_matrix.SLICE
-    total, done = mi.Vector4f(0), dr.zeros(mi.UInt32, lanes)
+    total = mi.Vector4f(0)
+    done = dr.zeros(mi.UInt32, lanes)
     while done < rows:
         total += dr.gather(mi.Vector4f, packed, place)
         place += sparse_matrix.SLICE
@@ -90,7 +91,8 @@ def matmul(shapes=SHAPES) -> list[dict]:
     Returns a row for each shape and layout: ``width``, ``points``, ``layout`` ("rows": a point a row), and
     for each product GFLOP/s, of the median.
     """
-    found, rng = [], np.random.default_rng(0)
+    found = []
+    rng = np.random.default_rng(0)
     for width, points in shapes:
         jobs = {}
         for layout in network.LAYOUTS:
@@ -114,7 +116,8 @@ def rays(count: int = 1 << 20) -> list[dict]:
     camera, _ = lit.mi.sensors()[0].sample_ray(0, 0, across, mi.Point2f(0.5))
     origins = rng.uniform((-2, 0.01, -2), 2, (count, 3)).astype(np.float32).T
     ways = rng.normal(size=(3, count)).astype(np.float32)
-    origins, ways = mi.Point3f(*map(mi.Float, origins)), mi.Vector3f(*map(mi.Float, ways))
+    origins = mi.Point3f(*map(mi.Float, origins))
+    ways = mi.Vector3f(*map(mi.Float, ways))
     camera = dr.opaque(mi.Ray3f(camera))
     scattered = dr.opaque(mi.Ray3f(origins, dr.normalize(ways)))
     taken = side_by_side(

@@ -88,7 +88,8 @@ def products(layout: str, points: int, inputs: int, outputs: int) -> list[tuple]
 def _products_alone(points, sizes):
     """Return a function that makes every product of a step, evaluated one by one as the step's are."""
     rng = np.random.default_rng(0)
-    made, jobs = {}, []
+    made = {}
+    jobs = []
     for i, (inputs, outputs) in enumerate(zip(sizes[:-1], sizes[1:], strict=True)):
         layer = products("rows", points, inputs, outputs)
         for _, a, b, flags in layer if i else layer[:2]:  # the first layer's input needs no gradient

@@ -77,7 +77,9 @@ def measured(settings, folder, measuring: str, **arguments) -> dict:
     """
     module, _, name = measuring.partition(":")
     called = getattr(importlib.import_module(f"experiments.engine.{module}"), name)
-    before, begun, not_finite = machine(), time.perf_counter(), []
+    before = machine()
+    begun = time.perf_counter()
+    not_finite = []
     tables = plain(called(settings, **arguments), "", not_finite)
     seconds = time.perf_counter() - begun
     return {"machine": before, "seconds": seconds, "tables": tables, "not_finite": not_finite}

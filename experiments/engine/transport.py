@@ -67,7 +67,8 @@ def measure(
     depth = transport.bounces + 1
     # Beside a reference of any depth no less than a run takes, beside T alone the same.
     prb_depth = max(AUTO_DEPTH, depth) if sun else depth
-    tracer, steps = PathTracer(lit, prb_spp, prb_depth, one_thread=False), itertools.count()
+    tracer = PathTracer(lit, prb_spp, prb_depth, one_thread=False)
+    steps = itertools.count()
     times = side_by_side(
         {
             "apply": lambda: transport.apply(env),
@@ -128,7 +129,8 @@ def measure(
 
 def load_scene(settings):
     """Load a configuration's scene in a square picture, with Mitsuba's default sampler."""
-    file, width = settings.scene.file, settings.scene.width
+    file = settings.scene.file
+    width = settings.scene.width
     return scene.load(file, width, width, settings.scene.parameters, sampler="independent")
 
 
@@ -247,7 +249,8 @@ def without_caustics(lit, sky: np.ndarray, spp: int) -> list[dict]:
     transport = LightTransport.build(lit, *sky.shape[:2], max_depth=2)
     transport.resolve(sky)
     halves = reference(lit, sky, spp, depth=2)
-    got, mirror = transport.apply(mi.TensorXf(sky)).numpy(), sees_mirror(lit)
+    got = transport.apply(mi.TensorXf(sky)).numpy()
+    mirror = sees_mirror(lit)
     return [
         {"part": part, "seen": int(mask.sum())} | errors(got, halves, mask)
         for part, mask in (("matte pixels", ~mirror), ("mirror pixels", mirror))

@@ -105,8 +105,11 @@ def piece(settings, folder, what: str, first: int, count: int, reader: str = "")
         memory that a file took beyond the image that it declares, bytes; ``faults``: [index, outcome, error]
         of every file that went wrong.
     """
-    whole, counts, errors = seeds(what), Counter(), Counter()
-    beyond, faults = 0, []
+    whole = seeds(what)
+    counts = Counter()
+    errors = Counter()
+    beyond = 0
+    faults = []
     with tempfile.TemporaryDirectory() as work, Worker(reader or what) as process:
 
         def read(name, data, index):
@@ -121,7 +124,8 @@ def piece(settings, folder, what: str, first: int, count: int, reader: str = "")
                         faults.append((name, answer["outcome"], answer.get("error", "")))
             name, data = case(what, whole, settings.seed, index)
             answer = read(name, data, index)
-            outcome, error = answer["outcome"], answer.get("error", "")
+            outcome = answer["outcome"]
+            error = answer.get("error", "")
             counts[outcome] += 1
             if outcome == "refused":
                 errors[answer["kind"]] += 1

@@ -108,7 +108,8 @@ def hdr_files() -> dict[str, bytes]:
     """Make Radiance files: run lengths new and old, flat pixels, a header with more lines."""
     pixels = shared_exponent()
     rows, columns = SIZE
-    new, old = bytearray(), bytearray()
+    new = bytearray()
+    old = bytearray()
     for row in pixels:
         new += bytes([2, 2, columns >> 8, columns & 255])
         for part in (part for band in row.T for part in (band[:20], band[20:])):
@@ -224,7 +225,8 @@ def weight_files() -> dict[str, bytes]:
         save(stream, **tensors(), more=np.arange(3))
         files[f"{save.__name__}.npz"] = stream.getvalue()
     for kind, dtype in (("F16", "<f2"), ("F32", "<f4"), ("F64", "<f8")):
-        entries, data = {"__metadata__": {"format": "pt"}}, b""
+        entries = {"__metadata__": {"format": "pt"}}
+        data = b""
         for name, values in tensors().items():
             start = len(data)
             data += values.astype(dtype).tobytes()

@@ -46,7 +46,8 @@ def main(reader: str, answers) -> None:
     answers.flush()
     for line in sys.stdin:
         request = json.loads(line)
-        path, declared = Path(request["path"]), request["declared"]
+        path = Path(request["path"])
+        declared = request["declared"]
         printed = os.fstat(2).st_size
         start = _reset_peak()
         room = min(ADDRESS_ROOM + MULTIPLE * declared, MOST_ADDRESS)

@@ -76,7 +76,8 @@ def render(sphere: Sphere, tonemapped_map: np.ndarray) -> np.ndarray:
     most of the noise of two pictures. Returns RGBA (540 / reduction, 960 / reduction, 4) float32, black where
     there is no sphere.
     """
-    (width, height), crop = (size // sphere.reduction for size in FILM), CROP // sphere.reduction
+    width, height = (size // sphere.reduction for size in FILM)
+    crop = CROP // sphere.reduction
     left, top = (width - crop) // 2, (height - crop) // 2
     film = {"type": "hdrfilm", "width": width, "height": height, "rfilter": {"type": "box"}}
     film |= {"crop_offset_x": left, "crop_offset_y": top, "crop_width": crop, "crop_height": crop}

@@ -103,7 +103,8 @@ def gained(done: Done, part: slice) -> float | None:
 def measure(done: Done) -> dict:
     """Return the numbers of a row. Maps are compared in units of the file: a scene's ``scale`` clips more."""
     original, edited, true = done.maps
-    render, ceiling = done.metrics["render"], done.metrics["ceiling"]
+    render = done.metrics["render"]
+    ceiling = done.metrics["ceiling"]
     return {
         **done.metrics,
         **done.metrics["natural"],

@@ -134,7 +134,9 @@ def shape_of(stroke):
 def paint(page, stroke):
     """Paint a stroke with the pointer, after its tool, shape and sliders."""
     at = lambda corner: place(page, "#overlay", *np.clip(corner, 0.001, 0.999))  # noqa: E731
-    kind, amount, color = stroke["type"], stroke.get("amount"), stroke.get("color", [1.0, 1.0, 1.0])
+    kind = stroke["type"]
+    amount = stroke.get("amount")
+    color = stroke.get("color", [1.0, 1.0, 1.0])
     most = max(1.0, *color)
     if kind == "shadow":
         amount = 1 - (1 - amount) * most
@@ -207,11 +209,13 @@ def picture(settings, folder, strokes) -> dict:
 
 
 def cases(given):
-    sky, found = puresky.file(MAP), []
+    sky = puresky.file(MAP)
+    found = []
     for name, title in TITLES.items():
         shipped = Path(__file__).parents[2] / "scenes/edits" / f"{name}.toml"
         asked = tomllib.loads(shipped.read_text())
-        tables, strokes = {"input": {"envmap": sky}, "scene": asked["scene"]}, asked["target"]["strokes"]
+        tables = {"input": {"envmap": sky}, "scene": asked["scene"]}
+        strokes = asked["target"]["strokes"]
         found.append(calling(name, edit, tables, {"edit": title}, strokes=strokes))
         if name == "move_shadow":
             page = calling("page", picture, tables, strokes=strokes)

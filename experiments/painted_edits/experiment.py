@@ -36,7 +36,8 @@ def explanation(notes: list[str]) -> str:
 
 def measure(done: Done) -> dict:
     original, edited, _ = done.maps
-    rows, painted = done.rows, done.metrics["painted"]
+    rows = done.rows
+    painted = done.metrics["painted"]
     before = metrics.high_frequency_energy(original[rows])
     return {
         **done.metrics,

@@ -71,7 +71,8 @@ def maps_of(args) -> dict[str, Path | str]:
 
 
 def cases(args):
-    kind, maps = KINDS[args.name], maps_of(args)
+    kind = KINDS[args.name]
+    maps = maps_of(args)
     made = []
     # Maps last: what shares a fit is then many jobs apart, and finds it on disk also with several workers.
     for settings, roughness, row, sky in itertools.product(
@@ -135,7 +136,8 @@ def seconds(done: Done) -> dict[str, float | None]:
     A fit that was on disk has the seconds that are kept with it; None where there is no fit. The rest is None
     where a run was interrupted and resumed, whose time is not known.
     """
-    fit, timing = done.metrics["fit"], done.metrics["timing"]
+    fit = done.metrics["fit"]
+    timing = done.metrics["timing"]
     resumed = json.loads((done.folder / DONE).read_bytes())["resumed"]
     rest = timing["total_s"] - (timing["fit_s"] if fit else 0)
     return {"fit_s": fit["seconds"] if fit else None, "rest_s": None if resumed else rest}

@@ -102,7 +102,9 @@ def edited(settings, folder, other, way, seed) -> dict:
     # ---- The picture
     true, _ = images.load_envmap(other, settings.input.width, False)
     unedited, _ = images.load_envmap(settings.input.envmap, settings.input.width, False)
-    camera, summary, curve = Camera("srgb"), "", "srgb"
+    camera = Camera("srgb")
+    summary = ""
+    curve = "srgb"
     model = WAYS[way].camera
     if model is None:
         file = folder / "picture.exr"
@@ -122,11 +124,13 @@ def edited(settings, folder, other, way, seed) -> dict:
         psnr = None
     else:
         result = envedit.edit(replace(settings, target=target))
-        found, seconds = result.envmap, result.metrics["timing"]["total_s"]
+        found = result.envmap
+        seconds = result.metrics["timing"]["total_s"]
         psnr = result.metrics["render"]["psnr"]
         images.write_exr(folder / "render.exr", result.render)
         if result.photo:
-            summary, curve = result.photo.summary, result.photo.camera.curve
+            summary = result.photo.summary
+            curve = result.photo.camera.curve
     images.write_exr(folder / "edited.exr", found)
     images.write_exr(folder / "true.exr", true)
 

@@ -125,7 +125,8 @@ def trained(path, folder):
 
     def with_network(kind, make):
         """Let a package make its measure with this network where it asks torchvision for the trained one."""
-        name, model = {"alex": "alexnet", "vgg": "vgg16"}[kind], features(kind)
+        name = {"alex": "alexnet", "vgg": "vgg16"}[kind]
+        model = features(kind)
         asked = getattr(torchvision.models, name)
         setattr(torchvision.models, name, lambda *_, **__: model)
         try:
@@ -136,7 +137,8 @@ def trained(path, folder):
     alex = with_network("alex", lambda: lpips.LPIPS(net="alex", verbose=False))
     vgg = with_network("vgg", lambda: lpips.LPIPS(net="vgg", verbose=False))
     dists = with_network("vgg", DISTS)
-    scores, drawn = [], []
+    scores = []
+    drawn = []
     with torch.no_grad():
         for x, y in pairs():
             drawn += [x, y]

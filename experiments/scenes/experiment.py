@@ -89,14 +89,17 @@ def plain(lit: scene.Scene, settings: config.Config, given: inputs.InputMap, fol
 
     Without a light of its own, the file that a run would leave.
     """
-    file, filled = settings.scene.file, {key: str(value) for key, value in settings.scene.parameters.items()}
+    file = settings.scene.file
+    filled = {key: str(value) for key, value in settings.scene.parameters.items()}
     if given.source == inputs.SUNSKY:
-        file, filled = str(folder / "lit.xml"), {}
+        file = str(folder / "lit.xml")
+        filled = {}
         mi.Bitmap(given.stored).write(str(folder / "sky.exr"))
         Path(file).write_text(scene.relit(settings.scene.file, "sky.exr", dict(settings.scene.parameters)))
     with quiet_libraries():
         whole = parser.called(Path(file).name, mi.load_file, file, **filled)
-        params, ours = mi.traverse(whole), lit.mi.sensors()[0].film()
+        params = mi.traverse(whole)
+        ours = lit.mi.sensors()[0].film()
         sizes = {"size": ours.size(), "crop_size": ours.crop_size(), "crop_offset": ours.crop_offset()}
         film = next(key for key, _ in params if key.endswith("film.size")).removesuffix("size")
         for key, value in sizes.items():

@@ -53,7 +53,8 @@ def cell(settings: config.Config, folder: Path, scene: str, sets: list[str]) -> 
     their overrides. Returns ``runs``: ``setting``, ``cost`` and ``judged`` of each, as :class:`.Judge`;
     ``bounds`` as :meth:`.Judge.bounds`.
     """
-    runs, standard = [], plan.base(settings.input.envmap, scene)
+    runs = []
+    standard = plan.base(settings.input.envmap, scene)
     for name, tables in plan.settings().items():
         inside = folder / name
         inside.mkdir(exist_ok=True)

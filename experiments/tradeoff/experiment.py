@@ -49,7 +49,8 @@ def costs(run: dict) -> dict:
     ``again_s`` is the time less what fit and tracing took: a run that finds them on disk takes a tenth of a
     second to load them, which is left out.
     """
-    cost, timing = run["cost"], run["judged"]["timing"]
+    cost = run["cost"]
+    timing = run["judged"]["timing"]
     return {
         "s": cost["wall_s"],
         "again_s": cost["wall_s"] - timing["fit_s"] - timing["transport_s"],

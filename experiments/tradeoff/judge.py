@@ -64,7 +64,8 @@ class Judge:
             ``psnr_without_noise``, see :func:`without_noise`; ``map``: psnr, ssim, mse of the upper half;
             ``sun_degrees``: angle between the brightest texels, None where the true map has no sun.
         """
-        halves, rows = self._halves(edited, self.spp, SEED), self._rows
+        halves = self._halves(edited, self.spp, SEED)
+        rows = self._rows
         place = latlong.directions(*self.true.shape[:2])
         peaks = [place[metrics.peak_position(m[rows])] for m in (edited, self.true)]
         sunny = luminance(self.true[rows]).max() > SUNNY

@@ -11,6 +11,7 @@ import numpy as np
 from envedit import config
 from envedit.images import images
 from envedit.scene import scene as scenes
+from envedit.scene.film import threads
 
 
 def loaded(chosen: config.Scene, envmap: np.ndarray, file: Path, width: int, height: int):
@@ -22,10 +23,8 @@ def loaded(chosen: config.Scene, envmap: np.ndarray, file: Path, width: int, hei
     images.write_exr(map_file, envmap)
     text = scenes.relit(chosen.file, map_file.name, dict(chosen.parameters), None, chosen.up, 1.0)
     file.write_text(text, encoding="utf-8")
-    threads = dr.thread_count()
-    dr.set_thread_count(max(2, threads))  # with one, Mitsuba's loader waits for ever
-    scene = mi.load_file(str(file))
-    dr.set_thread_count(threads)
+    with threads(max(2, dr.thread_count())):  # with one, Mitsuba's loader waits for ever
+        scene = mi.load_file(str(file))
     params = mi.traverse(scene)
     film = next(name for name, *_ in params if name.endswith("film.size")).removesuffix("size")
     for key in ("size", "crop_size"):

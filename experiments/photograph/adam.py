@@ -12,7 +12,7 @@ import numpy as np
 from envedit import config
 from envedit.core.resampling import fit
 from envedit.images import images
-from experiments import plain_mitsuba
+from experiments.plain_mitsuba import loaded
 
 STEPS, SPP, RATE = 150, 16, 0.05
 
@@ -26,7 +26,7 @@ def edited_by_adam(settings: config.Config, envmap: np.ndarray, photo: Path) -> 
     # ---- Scene and target
     chosen = settings.scene
     file = photo.with_name("start.xml")
-    scene, params = plain_mitsuba.loaded(chosen, envmap, file, chosen.width, chosen.width)
+    scene, params = loaded(chosen, envmap, file, chosen.width, chosen.width)
     target = mi.TensorXf(fit(images.read(str(photo))[0], chosen.width, chosen.width))
     target *= dr.mean(mi.render(scene, spp=64).array) / dr.mean(target.array)
 

@@ -13,10 +13,11 @@ import envedit
 from envedit import config, inputs
 from envedit.core.color import tonemap
 from envedit.images import images
-from experiments import plain_mitsuba, puresky
+from experiments import puresky
 from experiments.harness import Done, Experiment, calling
 from experiments.measures import psnr
 from experiments.natural.experiment import picked
+from experiments.plain_mitsuba import loaded
 from experiments.summary import Summary
 
 SCENES = ("sphere", "statue", "matpreview")
@@ -108,7 +109,7 @@ def write_png(settings, folder, true, file) -> None:
     """
     size = inputs.load_scene(settings.scene)
     file_of_scene = folder / "true.xml"
-    scene, _ = plain_mitsuba.loaded(settings.scene, true, file_of_scene, size.width, size.height)
+    scene, _ = loaded(settings.scene, true, file_of_scene, size.width, size.height)
     rendering = mi.Bitmap(mi.render(scene, spp=PNG_SPP, seed=PNG_SEED))
     shown = rendering.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.UInt8, srgb_gamma=True)
     shown.write(str(file))

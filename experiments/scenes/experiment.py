@@ -5,6 +5,7 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -13,6 +14,7 @@ from envedit.core import shipped
 from envedit.core.errors import EnveditError, InputError
 from envedit.core.quiet_libraries import quiet_libraries
 from envedit.scene import parser, scene
+from envedit.scene.film import threads
 from experiments.harness import Done, Experiment, calling
 from experiments.summary import Summary, values
 
@@ -91,12 +93,13 @@ def plain(lit: scene.Scene, settings: config.Config, given: inputs.InputMap, fol
     """
     file = settings.scene.file
     filled = {key: str(value) for key, value in settings.scene.parameters.items()}
-    if given.source == inputs.SUNSKY:
-        file = str(folder / "lit.xml")
-        filled = {}
-        mi.Bitmap(given.stored).write(str(folder / "sky.exr"))
-        Path(file).write_text(scene.relit(settings.scene.file, "sky.exr", dict(settings.scene.parameters)))
-    with quiet_libraries():
+    with threads(max(2, dr.thread_count())), quiet_libraries():  # with one thread, files are waited for
+        if given.source == inputs.SUNSKY:
+            file = str(folder / "lit.xml")
+            filled = {}
+            mi.Bitmap(given.stored).write(str(folder / "sky.exr"))
+            text = scene.relit(settings.scene.file, "sky.exr", dict(settings.scene.parameters))
+            Path(file).write_text(text)
         whole = parser.called(Path(file).name, mi.load_file, file, **filled)
         params = mi.traverse(whole)
         ours = lit.mi.sensors()[0].film()

@@ -47,7 +47,8 @@ def scenes_of(
 ) -> dict[str, Scene]:
     """Load a scene "without" and "with" what is inserted, and that "alone"; their files go to a folder.
 
-    ``first`` is the beginning of the first thing that is seen in the scene; 0: the film's aspect ratio.
+    ``first`` is the beginning of the first thing that is seen in the scene. A height of 0 is by the film's
+    aspect ratio.
     """
     texts = {
         "without": scene,

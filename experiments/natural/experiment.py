@@ -103,6 +103,7 @@ def gained(done: Done, part: slice) -> float | None:
 def measure(done: Done) -> dict:
     """Return the numbers of a row. Maps are compared in units of the file: a scene's ``scale`` clips more."""
     original, edited, true = done.maps
+    half = len(original) // 2
     render = done.metrics["render"]
     ceiling = done.metrics["ceiling"]
     return {
@@ -112,8 +113,8 @@ def measure(done: Done) -> dict:
         "psnr": psnr(edited, true),
         "unedited": psnr(original, true),
         "gain": gained(done, slice(None)),
-        "upper": gained(done, slice(0, WIDTH // 4)),
-        "lower": gained(done, slice(WIDTH // 4, None)),
+        "upper": gained(done, slice(0, half)),
+        "lower": gained(done, slice(half, None)),
     }
 
 

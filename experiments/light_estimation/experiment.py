@@ -44,22 +44,16 @@ def cases(args):
     return made[: args.count]
 
 
-def pictures(envmap: np.ndarray) -> dict[str, np.ndarray]:
-    """Render every sphere under a map (H, W, 3) of linear radiance."""
-    tonemapped = protocol.tonemapped(envmap)
-    return {name: protocol.render(sphere, tonemapped) for name, sphere in protocol.SPHERES.items()}
-
-
 def measure(done: Done) -> list[dict]:
     """Return rows of the edited and of the unedited map: one for each sphere, and one of the map itself."""
     original, edited, true = done.maps
     lights = json.loads((done.folder / "lights.json").read_bytes())
     true_lights = light_list.listed(separate(true).lights, true.shape[:2], np.eye(3))
-    expected = pictures(true)
+    expected = protocol.pictures(true)
     rows = []
     for kind, envmap, when in (("edited", edited, "after"), ("unedited", original, "before")):
         about = {"kind": kind, "rendering": done.metrics["render"]["psnr"]}
-        for sphere, picture in pictures(envmap).items():
+        for sphere, picture in protocol.pictures(envmap).items():
             errors = protocol.compared(picture, expected[sphere])
             rows.append(about | {"sphere": sphere} | errors)
         stops = np.abs(irradiance_error(envmap, true))
@@ -129,7 +123,7 @@ COLUMNS = {
 
 def panels(done: Done):
     """Return each sphere under the unedited, the edited and the true map."""
-    of_maps = [pictures(envmap) for envmap in done.maps]
+    of_maps = [protocol.pictures(envmap) for envmap in done.maps]
     return [protocol.display(spheres[name]) for name in protocol.SPHERES for spheres in of_maps]
 
 

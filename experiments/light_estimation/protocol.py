@@ -96,6 +96,12 @@ def render(sphere: Sphere, tonemapped_map: np.ndarray) -> np.ndarray:
     return np.pad(picture, ((top, height - top - crop), (left, width - left - crop), (0, 0)))
 
 
+def pictures(envmap: np.ndarray) -> dict[str, np.ndarray]:
+    """Render every sphere under a map (H, W, 3) of linear radiance."""
+    light = tonemapped(envmap)
+    return {name: render(sphere, light) for name, sphere in SPHERES.items()}
+
+
 def display(picture: np.ndarray) -> np.ndarray:
     """Return the part of a picture that :func:`render` renders as display values, (300, 300, 3)."""
     reduction = FILM[1] // len(picture)

@@ -161,9 +161,9 @@ def measured(envmap, true) -> dict:
         "brightness": float(stops.mean()),
         "irradiance": float(np.abs(stops - stops.mean()).mean()),
     }
-    lit = [protocol.tonemapped(one) for one in (envmap, true)]
-    for name, sphere in protocol.SPHERES.items():
-        errors = protocol.compared(*(protocol.render(sphere, one) for one in lit))
+    expected = protocol.pictures(true)
+    for name, picture in protocol.pictures(envmap).items():
+        errors = protocol.compared(picture, expected[name])
         found[f"{name} si-RMSE"] = errors["si_rmse"]
         found[f"{name} angle"] = errors["angle"]
     return found

@@ -439,10 +439,10 @@ class _Edit:
     def compare_photograph(self):
         """Set the camera of the metrics, and the pixels that the light does not explain."""
         photo, weight = self.target.photo, self.target.weight
-        likelihood = Likelihood.of_target(self.target)
+        likelihood = replace(Likelihood.of_target(self.target), least_noise=SIGMA)
         residual = photo.missed(self.renders["edited"])
         of_rendering = 0.0 if self.noise is None else self.noise
-        deviations = sizes(residual)[..., 0] / np.hypot(likelihood.noise(residual, SIGMA), of_rendering)
+        deviations = sizes(residual)[..., 0] / np.hypot(likelihood.noise(residual), of_rendering)
         self.outliers = (deviations > OUTLIER_DEVIATIONS) & (likelihood.weight[..., 0] > 0)
         counted = 1.0 if weight is None else float((weight > 0).mean())
         share = float(self.outliers.mean()) / counted

@@ -20,7 +20,7 @@ from envedit.representations.layers.gain import LEVELS
 from envedit.representations.layers.unseen import unseen_kept
 from envedit.scene.scene import Scene
 from envedit.solve import block_jacobian, prior
-from envedit.solve.likelihood import SIGMA, Likelihood
+from envedit.solve.likelihood import Likelihood
 from envedit.solve.map_problem import Photographed, Problem
 from envedit.targets.target import Target
 from envedit.transport.light_transport import LightTransport
@@ -95,12 +95,6 @@ class EditState:
     def rendered(self) -> bool:
         """Whether the target is a rendering, and not painted."""
         return self.target.coverage is None
-
-    @property
-    def sigma(self) -> float:
-        """Standard error of display values: that of the target, at least :data:`.likelihood.SIGMA`."""
-        noise = self.target.noise
-        return SIGMA if noise is None else max(SIGMA, float(np.median(noise)))
 
     def decode(self, params: Params) -> np.ndarray:
         """Parameters to a whole map on the host, refusing what is not finite."""

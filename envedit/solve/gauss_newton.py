@@ -15,7 +15,6 @@ import numpy as np
 
 from envedit.core.errors import NumericalError
 from envedit.solve.derivatives import NARROW_ANGLE, WIDE_ANGLE
-from envedit.solve.likelihood import SIGMA
 from envedit.solve.map_problem import Point, Posterior, Problem
 
 MOST_STEPS, LEAST_DECREASE = 16, 2e-3
@@ -87,7 +86,6 @@ class Solution:
 def solve(
     problem: Problem,
     params: dict,
-    sigma: float = SIGMA,
     iterations: int = 2 * MOST_STEPS,
     after_step: Callable[[Run, Point], None] | None = None,
     run: Run | None = None,
@@ -102,8 +100,6 @@ def solve(
         What is minimised.
     params : dict
         The map as it is: where lights start, and are drawn to.
-    sigma : float
-        Standard error that display values are known to.
     iterations : int
         Most steps.
     after_step : callable, optional
@@ -132,23 +128,23 @@ def solve(
     if after_step and (known or not iterations):
         after_step(run, point)
     left = min(iterations, run.most) - len(run.history)
-    point = descended(problem, run, point, sigma, left, after_step)
-    normal = problem.curvature(point, run.start, sigma)
+    point = descended(problem, run, point, left, after_step)
+    normal = problem.curvature(point, run.start)
     note = ""
     whole = run
     first = problem.evaluate(start, resolve=False) if sparing and run.history else None
     if first is not None and first.residual is not None:
         before = replace(run, state=start, start=start)
-        loss = problem.unlikeliness(point, run.start, sigma) + 2 * normal.determined
-        noise = problem.likelihood.noise(point.residual, sigma)
-        near = problem.likelihood.noise(first.residual, sigma) < COMPARED_NOISE_RATIO * noise
-        if problem.unlikeliness(first, start, sigma) <= loss:
+        loss = problem.unlikeliness(point, run.start) + 2 * normal.determined
+        noise = problem.likelihood.noise(point.residual)
+        near = problem.likelihood.noise(first.residual) < COMPARED_NOISE_RATIO * noise
+        if problem.unlikeliness(first, start) <= loss:
             note = "kept the initialisation: the better match of the rendering does not justify "
             note += f"{normal.determined:.0f} parameters (Akaike criterion)"
         elif judge is not None and near and KEPT_ERROR_SHARE * judge(first.edited) <= judge(point.edited):
             note = "kept the initialisation: path-traced, it is as close to the target as the solution"
         if note:
-            run, normal = before, problem.curvature(first, start, sigma)
+            run, normal = before, problem.curvature(first, start)
     return Solution(
         problem.solution_params(run.state), run.history, whole, problem.posterior(run.state, normal), note
     )
@@ -158,7 +154,6 @@ def descended(
     problem: Problem,
     run: Run,
     point: Point,
-    sigma: float = SIGMA,
     steps: int = 1,
     after_step: Callable[[Run, Point], None] | None = None,
 ) -> Point:
@@ -171,7 +166,7 @@ def descended(
         began = time.perf_counter()
 
         # ---- Huber's threshold: the noise, at most halved at once
-        noise = problem.likelihood.noise(point.residual, sigma)
+        noise = problem.likelihood.noise(point.residual)
         halved = run.scale / 2 if np.isfinite(run.scale) else 0
         run.scale = min(run.scale, max(noise, halved))
 
@@ -186,7 +181,7 @@ def descended(
 
         # ---- Whether it is the last one
         little = better is None or before - loss < LEAST_DECREASE * before
-        ended = little and run.scale <= 1.01 * problem.likelihood.noise(point.residual, sigma)
+        ended = little and run.scale <= 1.01 * problem.likelihood.noise(point.residual)
         run.finished = ended and (run.wide or not problem.shining(run.state))
         if ended and not run.wide:  # other derivatives: what damping those needed says nothing of them
             run.wide, run.damping = True, Run.damping

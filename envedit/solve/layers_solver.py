@@ -57,7 +57,6 @@ class LayersSolver:
             explanation = search.search(
                 problem,
                 problem.state(params),
-                self.edit.sigma,
                 after_step,
                 most=edit.settings.optimizer.iterations if edit.newton else search.EXPLANATION_STEPS,
             )
@@ -85,9 +84,7 @@ class LayersSolver:
         most, problem = self.edit.settings.optimizer.iterations, self.edit.problem()
         problem.evaluate(self.begun.state)  # another edit may have taken its columns of T
         while self.begun is not None:
-            solution = gauss_newton.solve(
-                problem, params, self.edit.sigma, most, run=self.begun, sparing=False
-            )
+            solution = gauss_newton.solve(problem, params, most, run=self.begun, sparing=False)
             self.begun = self._another(solution)
         point = problem.evaluate(solution.run.state)  # what was tried since may have taken its columns
         self.begun = solution.run
@@ -97,7 +94,7 @@ class LayersSolver:
                 self.edit.scene, point.edited, settings.seed, settings.renderer.cache
             )
             point = replace(point, residual=problem.residual(point.state, shown))
-        return search.score(problem, solution.run, point, self.edit.sigma)
+        return search.score(problem, solution.run, point)
 
     def go_on_from(self, file: str, params: Params) -> None:
         """Let :meth:`optimise` go on from a solution on disk; InputError if it is not of these layers."""
@@ -156,9 +153,7 @@ class LayersSolver:
         """Make steps; what those towards a photograph find of its camera is taken off the target."""
         photographed = self.edit.target.photo is not None
         judge = self._display_error if sparing and not photographed else None
-        solution = gauss_newton.solve(
-            problem, params, self.edit.sigma, iterations, after_step, run, sparing, judge
-        )
+        solution = gauss_newton.solve(problem, params, iterations, after_step, run, sparing, judge)
         if photographed:
             self._take_off_camera(solution)
         return solution
@@ -197,7 +192,7 @@ class LayersSolver:
             if interrupt and interrupt.is_set():
                 raise Interrupted(edit.decode(solution.params), len(run.history))
 
-        likelier = search.further(edit.problem(), run, self.edit.sigma, after_step)
+        likelier = search.further(edit.problem(), run, after_step)
         if likelier is None:
             return None
         self._likelier.append(f"then likelier: {likelier.name} (-2 log evidence {likelier.score:.1f})")
@@ -253,9 +248,10 @@ class LayersSolver:
             point = problem.evaluate(one.state)
             if point.residual is None:
                 continue
-            point = gauss_newton.descended(problem, one, point, self.edit.sigma, search.EXPLANATION_STEPS)
+            point = gauss_newton.descended(problem, one, point, search.EXPLANATION_STEPS)
             seen = edit.target.photo.exposed_by(one.state["camera"][0])
-            unlikeliness = problem.likelihood.at_best(seen.missed(point.rendering), SIGMA)
+            likelihood = replace(problem.likelihood, least_noise=SIGMA)
+            unlikeliness = likelihood.at_best(seen.missed(point.rendering))
             tried.append((unlikeliness + problem.penalty(one.state, one.start), seen, one))
         if not tried:  # no curve gives a finite rendering
             edit.target = before

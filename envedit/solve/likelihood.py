@@ -8,8 +8,8 @@ logarithm of the likelihood is, but for a constant,
 * A is the number of pixels whose errors go together, n = pixels / A the number of independent values of a
   channel. A rendering has :data:`INDEPENDENT`. A stroke is no measurement of each pixel that it covers, but a
   few statements (:data:`STATEMENTS`) of somebody who cannot paint physics.
-* sigma is the most likely one; of paint at most :data:`PAINT_NOISE` times the change that was painted, or
-  paint that can be followed in part only would be taken for noise.
+* sigma is the most likely one, at least that of the target; of paint at most :data:`PAINT_NOISE` times the
+  change that was painted, or paint that can be followed in part only would be taken for noise.
 * rho_s is Huber's loss: quadratic up to s, linear beyond. Of a rendering s = sigma, so that pixels which no
   light can explain (caustics, shadow edges) have limited weight. Of a painted picture every residual counts
   by its square: a large one is the change that is asked for.
@@ -22,7 +22,7 @@ logarithm of the likelihood is, but for a constant,
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -52,6 +52,7 @@ class Likelihood:
     # (h, w, 1), how much each pixel counts beside the others; 1 on average (:func:`on_average_one`)
     weight: np.ndarray
     independent: float = INDEPENDENT  # independent values of a channel among the pixels
+    least_noise: float = SIGMA  # standard error that display values have at least
     paint_noise: float | None = None  # largest standard error of paint, of display values; None: a rendering
     # (h, w, 1), how much each pixel is of the rest, in [0, 1], whose mean is to stay; None: there is none
     rest: np.ndarray | None = None
@@ -84,10 +85,17 @@ class Likelihood:
 
     @classmethod
     def of_target(cls, target: Target) -> Likelihood:
-        """Return that of a target's residuals: of a rendering, or of paint where it has coverage."""
+        """Return that of a target's residuals: of a rendering, or of paint where it has coverage.
+
+        Display values have the standard error of the target, at least :data:`SIGMA`.
+        """
         if target.coverage is None:
-            return cls(on_average_one(target.weight, target.picture.shape[:2]))
-        return cls.of_paint(target.weight, target.coverage, target.initial, target.picture)
+            likelihood = cls(on_average_one(target.weight, target.picture.shape[:2]))
+        else:
+            likelihood = cls.of_paint(target.weight, target.coverage, target.initial, target.picture)
+        if target.noise is None:
+            return likelihood
+        return replace(likelihood, least_noise=max(SIGMA, float(np.median(target.noise))))
 
     @property
     def robust(self) -> bool:
@@ -134,17 +142,18 @@ class Likelihood:
             weight = weight * np.minimum(1, sigma / np.maximum(sizes(residual), 1e-12))
         return weight
 
-    def noise(self, residual: np.ndarray, least: float) -> float:
+    def noise(self, residual: np.ndarray) -> float:
         """Return the standard error under which the first part is what independent values of it have, 3 n.
 
         The most likely one: for squares exactly, with Huber's loss as an M-estimate of scale (not his
-        proposal 2). At least ``least``, of paint at most :attr:`paint_noise`.
+        proposal 2). At least :attr:`least_noise`, of paint at most :attr:`paint_noise`.
         """
+        least = self.least_noise
         ratio = self._pixels(residual, least) / (3 * self.independent)
         if ratio <= 1:
             return least
         if not self.robust:
-            return float(np.sqrt(self.variance(ratio * least**2, least)))
+            return float(np.sqrt(self.variance(ratio * least**2)))
         # With the n smallest r within sigma, a their sum of w r^2, and b, c those of w r and w of the others,
         # (a + 2 b sigma - c sigma^2) / (d sigma^2) is to be 1: of the n whose root lies in its range.
         size = sizes(residual)
@@ -157,13 +166,14 @@ class Likelihood:
         inside = np.flatnonzero((sigma >= np.append(0, r)) & (sigma <= np.append(r, np.inf)))
         return float(max(least, sigma[inside[0]] if len(inside) else r[-1]))
 
-    def variance(self, square: Any, least: float) -> Any:
+    def variance(self, square: Any) -> Any:
         """Return the most likely squared standard error of paint, given the mean square of its residuals."""
-        return np.clip(square, least**2, max(least, self.paint_noise or np.inf) ** 2)
+        most = max(self.least_noise, self.paint_noise or np.inf)
+        return np.clip(square, self.least_noise**2, most**2)
 
-    def at_best(self, residual: np.ndarray, least: float) -> float:
+    def at_best(self, residual: np.ndarray) -> float:
         """Return the formula above at the most likely noise."""
-        sigma = self.noise(residual, least)
+        sigma = self.noise(residual)
         return self.misfit(residual, sigma) + 6 * self.independent * float(np.log(sigma))
 
 

@@ -190,9 +190,9 @@ class Problem(Unknowns):
         """Return F."""
         return self.likelihood.misfit(point.residual, sigma) + self.penalty(point.state, start)
 
-    def unlikeliness(self, point: Point, start: dict, sigma: float) -> float:
+    def unlikeliness(self, point: Point, start: dict) -> float:
         """Return -2 log posterior density at the noise that the residual shows, but for a constant."""
-        return self.likelihood.at_best(point.residual, sigma) + self.penalty(point.state, start)
+        return self.likelihood.at_best(point.residual) + self.penalty(point.state, start)
 
     def penalty(self, state: dict, start: dict) -> float:
         """Return x' K x; ``start`` is where the search has put the lights."""
@@ -289,9 +289,9 @@ class Problem(Unknowns):
             mean_of_rest=MeanOfRest(mean_by_unknowns, mean, share * slope, mean_by_blocks),
         )
 
-    def curvature(self, point: Point, start: dict, sigma: float) -> Normal:
+    def curvature(self, point: Point, start: dict) -> Normal:
         """Return the normal equations without descent, at the noise that the residual shows."""
-        return self.normal(point, start, self.likelihood.noise(point.residual, sigma), descent=False)
+        return self.normal(point, start, self.likelihood.noise(point.residual), descent=False)
 
     def _pulled_back(self, point, picture):
         """Return the derivatives of the sum of a picture times T E.

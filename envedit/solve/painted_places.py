@@ -48,7 +48,7 @@ class Place:
     degrees: float = LOBE_DEGREES  # radius of a light that is added
 
 
-def best(problem: Problem, state: dict, k: int, sigma: float, away: np.ndarray | None = None) -> list[Place]:
+def best(problem: Problem, state: dict, k: int, away: np.ndarray | None = None) -> list[Place]:
     """List where light ``k``, dark in a state, raises the likelihood most.
 
     All cells of the sky are tried through the block transport, with several fluxes each, and texels around
@@ -60,12 +60,11 @@ def best(problem: Problem, state: dict, k: int, sigma: float, away: np.ndarray |
     _, directions = blocks.sky
     if point.residual is None or not len(directions):
         return []
-    trial = _Trial(problem, point, k, sigma)
+    trial = _Trial(problem, point, k)
     weight = blocks.summed(likelihood.weight)
     total = np.maximum(weight, 1e-30)
     compared = _Comparison(
         likelihood=likelihood,
-        sigma=sigma,
         before=blocks.summed(likelihood.weight * point.rendering) / total,
         target=blocks.summed(likelihood.weight * problem.picture) / total,
         weight=weight[:, 0],
@@ -94,13 +93,12 @@ def _smallest(sizes):
 class _Trial:
     """A light in place of none, in the picture of a point."""
 
-    def __init__(self, problem, point, k, sigma):
+    def __init__(self, problem, point, k):
         self.problem, self.k = problem, k
         self.own, self.flux = k < problem.layers.lights.own, problem.layers.lights.flux[k]
         self.ground = lit_ground(problem, point)
         self._compared = _Comparison(
             likelihood=problem.likelihood,
-            sigma=sigma,
             before=point.rendering.reshape(-1, 3),
             target=problem.picture.reshape(-1, 3),
             weight=problem.likelihood.weight.ravel(),
@@ -148,7 +146,6 @@ class _Comparison:
     """
 
     likelihood: Likelihood
-    sigma: float
     before: np.ndarray
     target: np.ndarray
     weight: np.ndarray
@@ -168,7 +165,7 @@ class _Comparison:
         squares, means = self._sums(pictures, factors)
         count = 3 * self.likelihood.independent
         squares = squares / self.likelihood.area
-        variance = self.likelihood.variance(squares / count, self.sigma)
+        variance = self.likelihood.variance(squares / count)
         unlikeliness = squares / variance + count * np.log(variance) + of_mean(means)
         least = unlikeliness.argmin(axis=0)[None]
         factor = np.take_along_axis(factors, least, axis=0)[0]

@@ -26,7 +26,7 @@ from envedit.core.rotations import rotation_vector
 from envedit.representations.layers.lights import DARK, log_flux_of
 from envedit.solve import gauss_newton, painted_places
 from envedit.solve.light_places import Places
-from envedit.solve.likelihood import INDEPENDENT, SIGMA
+from envedit.solve.likelihood import INDEPENDENT
 from envedit.solve.map_problem import LARGEST_STEP, Problem
 from envedit.solve.painted_places import POSITIVE_EVIDENCE
 from envedit.solve.unknowns import Point, with_light
@@ -87,42 +87,41 @@ class _Move:
 def search(
     problem: Problem,
     start: dict,
-    sigma: float = SIGMA,
     after_step: Callable[[], None] | None = None,
     most: int = EXPLANATION_STEPS,
 ) -> Explanation:
     """Find the likeliest explanation, from ``start``, the state of the map as it is.
 
-    ``sigma`` is the least standard error of display values, ``most`` bounds the Gauss-Newton steps after
-    which explanations are compared. ``after_step`` is called now and then; what it raises ends the search.
+    ``most`` bounds the Gauss-Newton steps after which explanations are compared. ``after_step`` is called now
+    and then; what it raises ends the search.
     """
     steps = min(most, EXPLANATION_STEPS)
-    best = _descended(problem, {}, gauss_newton.Run(start, start), sigma, steps)
+    best = _descended(problem, {}, gauss_newton.Run(start, start), steps)
     cleared = {name: np.zeros_like(start[name]) for name in ("gain", "saturation")}
     compared: list[Explanation] = [best]
     better = best if best.point.residual is not None else None
     while better:
         best = better
-        moves = _moves(problem, best, sigma)
-        kinds = _best_kinds(moves) if len(compared) == 1 and _unfollowed(problem, best, sigma) else ()
+        moves = _moves(problem, best)
+        kinds = _best_kinds(moves) if len(compared) == 1 and _unfollowed(problem, best) else ()
         promising = [move for move in moves if move.gain > 0 or (move.light, move.what) in kinds]
-        neighbours = _neighbours(problem, best, promising, sigma, after_step, steps, cleared)
+        neighbours = _neighbours(problem, best, promising, after_step, steps, cleared)
         compared += neighbours
         better = _likelier(best, neighbours)
     return replace(best, others=_others(best, compared))
 
 
 def further(
-    problem: Problem, run: gauss_newton.Run, sigma: float, after_step: Callable[[], None] | None = None
+    problem: Problem, run: gauss_newton.Run, after_step: Callable[[], None] | None = None
 ) -> Explanation | None:
     """Find an explanation that is likelier than a solution, whose sky it begins with; None if there is none.
 
     ``run`` is where no step leads further; other parameters are those of :func:`search`.
     """
     point = problem.evaluate(run.state, resolve=False)
-    best = Explanation({}, run, point, score(problem, run, point, sigma))
-    promising = [move for move in _moves(problem, best, sigma) if move.gain > 0]
-    return _likelier(best, _neighbours(problem, best, promising, sigma, after_step, EXPLANATION_STEPS, {}))
+    best = Explanation({}, run, point, score(problem, run, point))
+    promising = [move for move in _moves(problem, best) if move.gain > 0]
+    return _likelier(best, _neighbours(problem, best, promising, after_step, EXPLANATION_STEPS, {}))
 
 
 def _likelier(best, explanations):
@@ -140,22 +139,23 @@ def _others(best, compared):
     return tuple(others.values())[:MOST_OTHERS]
 
 
-def _unfollowed(problem, best, sigma):
+def _unfollowed(problem, best):
     """Whether paint is followed so little that its noise is the largest there may be."""
-    most = problem.likelihood.paint_noise
-    if most is None or most <= sigma:
+    likelihood = problem.likelihood
+    most = likelihood.paint_noise
+    if most is None or most <= likelihood.least_noise:
         return False
-    return problem.likelihood.noise(best.point.residual, sigma) >= most
+    return likelihood.noise(best.point.residual) >= most
 
 
-def _neighbours(problem, best, moves, sigma, after_step, steps, sky):
+def _neighbours(problem, best, moves, after_step, steps, sky):
     """List the explanations one of some moves from another, begun under a sky."""
     neighbours = []
     for move in moves:
         history = list(best.run.history) if not sky else []
         run = gauss_newton.Run(move.state | sky, move.centre, history=history)
         done = move.after(best.done, problem.layers.lights.own)
-        neighbours.append(_descended(problem, done, run, sigma, steps))
+        neighbours.append(_descended(problem, done, run, steps))
         if after_step:
             after_step()
     return neighbours
@@ -177,12 +177,12 @@ def _cost_of_light(problem: Problem) -> float:
     return ADDED_LIGHT_COST + _cost_of_place(problem)
 
 
-def score(problem: Problem, run: gauss_newton.Run, point: Point, sigma: float) -> float:
+def score(problem: Problem, run: gauss_newton.Run, point: Point) -> float:
     """Return -2 log evidence at a point, but for a constant; inf where it is not finite."""
     if point.residual is None:
         return np.inf
     # ---- log det H - log det K
-    normal = problem.curvature(point, run.start, sigma)
+    normal = problem.curvature(point, run.start)
     _, posterior = np.linalg.slogdet(normal.hessian)
     _, prior = np.linalg.slogdet(normal.precision)
     # ---- What lights cost
@@ -190,7 +190,7 @@ def score(problem: Problem, run: gauss_newton.Run, point: Point, sigma: float) -
     cost += (_cost_of_choice(problem) + _cost_of_place(problem)) * len(_replaced(problem, run))
     if problem.likelihood.robust:
         cost += FADED_LIGHT_COST * len(_faded(problem, run.state))
-    evidence = float(problem.unlikeliness(point, run.start, sigma) + posterior - prior + cost)
+    evidence = float(problem.unlikeliness(point, run.start) + posterior - prior + cost)
     return evidence if np.isfinite(evidence) else np.inf
 
 
@@ -206,22 +206,22 @@ def _faded(problem, state):
     return [k for k in problem.shining(state) if k < own and state["flux"][k].mean() < FADED_LOG_FLUX]
 
 
-def _descended(problem, done, run, sigma, steps):
+def _descended(problem, done, run, steps):
     """Return the explanation that a few steps from where a run is lead to."""
     point = problem.evaluate(run.state)
     if point.residual is not None:
-        point = gauss_newton.descended(problem, run, point, sigma, steps)
-    return Explanation(done, run, point, score(problem, run, point, sigma))
+        point = gauss_newton.descended(problem, run, point, steps)
+    return Explanation(done, run, point, score(problem, run, point))
 
 
 # ---- Moves -------------------------------------------------------------------------------------------------
 
 
-def _moves(problem, best, sigma):
+def _moves(problem, best):
     """List the moves of each kind that promise as much from an explanation as the best one does."""
     painted = not problem.likelihood.robust
     of_kind: dict[tuple[int, str], list[_Move]] = {}
-    for move in (_under_the_original if painted else _beside_the_sky)(problem, best, sigma):
+    for move in (_under_the_original if painted else _beside_the_sky)(problem, best):
         of_kind.setdefault((move.light, move.what), []).append(move)
     return [
         move
@@ -237,13 +237,13 @@ def _best_kinds(moves):
     return list(dict.fromkeys((move.light, move.what) for move in ranked))[:MOST_OTHERS]
 
 
-def _beside_the_sky(problem, best, sigma):
+def _beside_the_sky(problem, best):
     """Yield moves that lower F together with one step of all else."""
     lights, state, start = problem.layers.lights, best.run.state, best.run.start
     problem.evaluate(state)  # what was tried since may have taken its columns of T
     for k in problem.shining(state):
         own, dark = k < lights.own, with_light(state, k, flux=DARK)
-        places = _places(problem, dark, start, sigma)
+        places = _places(problem, dark, start)
         if places is None:
             continue
         # With the columns of T that the dark sky was rendered with.
@@ -265,33 +265,32 @@ def _beside_the_sky(problem, best, sigma):
     # ---- one more
     spare = [k for k in range(lights.own, lights.count) if k not in problem.added(state)]
     for k in spare[:1]:
-        places = _places(problem, state, start, sigma)
+        places = _places(problem, state, start)
         for there in places.best(k) if places else []:
             turn, flux = rotation_vector(lights.centres[k], there.direction), np.log(there.factor)
             more, centre = (with_light(one, k, turn=turn, flux=flux, size=0.0) for one in (state, start))
             yield _Move(k, ADDED, more, centre, gain=there.fall - ADDED_LIGHT_COST)
 
 
-def _places(problem, state, start, sigma):
+def _places(problem, state, start):
     """Return the places of lights that are dark in a state; None where F has no value there."""
     point = problem.evaluate(state, resolve=False)
     if point.residual is None:
         return None
     try:
-        return Places(
-            problem, point, problem.normal(point, start, problem.likelihood.noise(point.residual, sigma))
-        )
+        normal = problem.normal(point, start, problem.likelihood.noise(point.residual))
+        return Places(problem, point, normal)
     except np.linalg.LinAlgError:
         return None
 
 
-def _under_the_original(problem, best, sigma):
+def _under_the_original(problem, best):
     """Yield moves that raise the likelihood under the gain of the original, all else as it is."""
     state = best.run.state | {name: np.zeros_like(best.run.state[name]) for name in ("gain", "saturation")}
     start = best.run.start
     lights = problem.layers.lights
     spare = [k for k in range(lights.own, lights.count) if k not in problem.added(state)]
-    now = _unlikeliness(problem, state, sigma)
+    now = _unlikeliness(problem, state)
 
     for k in problem.shining(state):
         own = k < lights.own
@@ -299,7 +298,7 @@ def _under_the_original(problem, best, sigma):
         # ---- elsewhere
         away = problem.direction(state, k)
         cost = _cost_of_choice(problem) if own and not start["turn"][k].any() else 0.0
-        for there in painted_places.best(problem, dark, k, sigma, away):
+        for there in painted_places.best(problem, dark, k, away):
             moved = _put(lights, state, k, there)
             centre = with_light(start, k, turn=moved["turn"][k]) if own else _put(lights, start, k, there)
             yield _Move(k, MOVED, moved, centre, gain=now - there.unlikeliness - cost)
@@ -310,15 +309,15 @@ def _under_the_original(problem, best, sigma):
             size = lights.log_size(painted_places.LARGER_DEGREES[0])
             soft = with_light(dark, spare[0], turn=turn, flux=flux, size=size)
             centre = with_light(start, spare[0], turn=turn, flux=flux, size=size)
-            yield _Move(k, SOFTENED, soft, centre, gain=now - _unlikeliness(problem, soft, sigma))
+            yield _Move(k, SOFTENED, soft, centre, gain=now - _unlikeliness(problem, soft))
         # ---- out, if it was added
         if not own:
-            gain = now - _unlikeliness(problem, dark, sigma) + ADDED_LIGHT_COST
+            gain = now - _unlikeliness(problem, dark) + ADDED_LIGHT_COST
             yield _Move(k, REMOVED, dark, start, gain)
 
     # ---- one more, as large as it must be
     for k in spare[:1]:
-        for there in painted_places.best(problem, state, k, sigma):
+        for there in painted_places.best(problem, state, k):
             more, centre = (_put(lights, one, k, there) for one in (state, start))
             yield _Move(k, ADDED, more, centre, gain=now - there.unlikeliness - ADDED_LIGHT_COST)
 
@@ -331,6 +330,6 @@ def _put(lights, state, k, there):
     return with_light(state, k, turn=turn, flux=there.log_flux, size=lights.log_size(there.degrees))
 
 
-def _unlikeliness(problem, state, sigma):
+def _unlikeliness(problem, state):
     point = problem.evaluate(state)
-    return np.inf if point.residual is None else problem.likelihood.at_best(point.residual, sigma)
+    return np.inf if point.residual is None else problem.likelihood.at_best(point.residual)

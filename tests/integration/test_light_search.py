@@ -8,7 +8,7 @@ from envedit.core import latlong
 from envedit.representations.layers.layers import Layers
 from envedit.scene import scene
 from envedit.solve import gauss_newton, search
-from envedit.solve.likelihood import SIGMA, Likelihood, on_average_one
+from envedit.solve.likelihood import Likelihood, on_average_one
 from envedit.solve.map_problem import Problem
 from envedit.transport.light_transport import LightTransport
 from tests.oracles.maps import angle
@@ -60,9 +60,9 @@ class Found:
         likelihood = Likelihood(on_average_one(weight, wanted.shape[:2]))
         problem = Problem(layers, transport, image, wanted, likelihood, saturates=True)
         likeliest = search.search(problem, problem.state(encoded))
-        solution = gauss_newton.solve(problem, encoded, SIGMA, run=likeliest.run)
-        while (likelier := search.further(problem, solution.run, SIGMA)) is not None:
-            solution = gauss_newton.solve(problem, encoded, SIGMA, run=likelier.run)
+        solution = gauss_newton.solve(problem, encoded, run=likeliest.run)
+        while (likelier := search.further(problem, solution.run)) is not None:
+            solution = gauss_newton.solve(problem, encoded, run=likelier.run)
         self.state = state = problem.state(solution.params)
         self.name, self.own = likeliest.name, layers.lights.own
         self.lit = {k: problem.direction(state, k) for k in problem.shining(state)}

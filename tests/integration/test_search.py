@@ -9,7 +9,7 @@ from envedit.representations.layers.layers import Layers
 from envedit.scene import scene
 from envedit.solve import search
 from envedit.solve.gauss_newton import Run
-from envedit.solve.likelihood import SIGMA, VISIBLE, Likelihood
+from envedit.solve.likelihood import VISIBLE, Likelihood
 from envedit.solve.map_problem import Problem
 from envedit.solve.prior import of_paint
 from envedit.targets.pixel_weights import FOLLOWING, pixel_weight
@@ -72,7 +72,7 @@ def painted(transport, image, other, share=1.0):
 def found_for(problem, start):
     """Return the likeliest explanation, its lights, and the score of the lights left where they are."""
     as_it_is = Run(start, start)
-    before = search.score(problem, as_it_is, problem.evaluate(start), SIGMA)
+    before = search.score(problem, as_it_is, problem.evaluate(start))
     calls = []
     found = search.search(problem, start, after_step=lambda: calls.append(1))
     state = found.run.state

@@ -36,7 +36,8 @@ def gaussian(rng, freedom):
     coverage = np.zeros((*FILM, 1), np.float32)
     coverage[:4] = 1
     weight = pixel_weight(coverage, np.zeros(FILM, bool), 1.0, 0.3)
-    likelihood = replace(Likelihood.of_paint(weight, coverage, before, picture), paint_noise=SIGMA)
+    likelihood = Likelihood.of_paint(weight, coverage, before, picture)
+    likelihood = replace(likelihood, least_noise=SIGMA, paint_noise=SIGMA)
     layers = Layers.of(image, cycles=3)
     params = layers.start()
     problem = Problem(layers, transport, image, picture, likelihood, of_paint(freedom))
@@ -66,7 +67,7 @@ def gaussian(rng, freedom):
     x = covariance @ jacobian.T @ np.linalg.solve(of_y, y)
     state = start | {"gain": x.reshape(3, -1).T}
     point = problem.evaluate(state)
-    found = search.score(problem, Run(state, start), point, SIGMA)
+    found = search.score(problem, Run(state, start), point)
     assert y @ np.linalg.solve(of_y, y) > 3  # the paint has its say
     return problem, start, found, expected + 6 * likelihood.independent * np.log(SIGMA)
 
@@ -85,7 +86,7 @@ def test_a_light_that_was_added_costs_what_it_says(rng):
     with_light["flux"][spare] = -25.0
     scores = []
     for state in (start, with_light):
-        scores.append(search.score(problem, Run(state, state), problem.evaluate(state), SIGMA))
+        scores.append(search.score(problem, Run(state, state), problem.evaluate(state)))
     assert problem.added(with_light) == [spare]
     assert scores[1] - scores[0] == pytest.approx(search.ADDED_LIGHT_COST, abs=0.05)
     assert np.isfinite(before)
@@ -99,6 +100,7 @@ def test_a_light_elsewhere_costs_as_many_as_it_could_be(lamps, rng):
     picture = transport.apply(mi.TensorXf(image)).numpy()
     coverage = np.ones((*FILM, 1), np.float32)
     likelihood = Likelihood.of_paint(coverage, coverage, picture, 0.9 * picture)
+    likelihood = replace(likelihood, least_noise=SIGMA)
     layers = Layers.of(image, cycles=3)
     problem = Problem(layers, transport, image, 0.9 * picture, likelihood, of_paint(0.1))
     start = problem.state(layers.start())
@@ -106,8 +108,8 @@ def test_a_light_elsewhere_costs_as_many_as_it_could_be(lamps, rng):
         there = start | {"turn": start["turn"].copy()}
         there["turn"][:moved, 1] = 0.5
         point = problem.evaluate(there)
-        normal = problem.curvature(point, there, SIGMA)
+        normal = problem.curvature(point, there)
         of_posterior, of_prior = (np.linalg.slogdet(one)[1] for one in (normal.hessian, normal.precision))
-        rest = problem.unlikeliness(point, there, SIGMA) + of_posterior - of_prior
-        cost = search.score(problem, Run(there, there), point, SIGMA) - rest
+        rest = problem.unlikeliness(point, there) + of_posterior - of_prior
+        cost = search.score(problem, Run(there, there), point) - rest
         assert cost == pytest.approx(moved * 2 * np.log(lamps), abs=1e-6)

@@ -5,6 +5,7 @@ transport is then a texel and a block a pixel, and the Jacobian is exact.
 """
 
 import dataclasses
+from copy import copy as shallow_copy
 
 import mitsuba as mi
 import numpy as np
@@ -18,7 +19,7 @@ from envedit.representations.layers.lights import DARK
 from envedit.solve import gauss_newton, light_places, map_problem, search
 from envedit.solve.derivatives import NARROW_ANGLE
 from envedit.solve.gauss_newton import Run, solve
-from envedit.solve.likelihood import SIGMA, Likelihood, on_average_one
+from envedit.solve.likelihood import Likelihood, on_average_one
 from envedit.solve.map_problem import Problem
 from envedit.solve.prior import PHOTOGRAPHED, Prior, of_paint
 from envedit.targets.pixel_weights import pixel_weight
@@ -54,6 +55,13 @@ def problem_of(image, transport, target, likelihood=None, cycles=3, aureoles=Tru
     layers = Layers.of(image, cycles=cycles, aureoles=aureoles)
     params = layers.start()
     return Problem(layers, transport, image, target, likelihood, **options), params
+
+
+def known_to(problem, sigma):
+    """Return the problem with display values that are known to a standard error of ``sigma``."""
+    problem = shallow_copy(problem)
+    problem.likelihood = dataclasses.replace(problem.likelihood, least_noise=sigma)
+    return problem
 
 
 def copy(state):
@@ -407,7 +415,8 @@ def test_linear_problem_has_its_closed_solution(rng, monkeypatch):
     hessian = jacobian.T @ jacobian / sigma**2 + precision
     expected = np.linalg.solve(hessian, jacobian.T @ by_channel / sigma**2)
 
-    solution = solve(problem, params, sigma, iterations=60, sparing=False)
+    problem = known_to(problem, sigma)
+    solution = solve(problem, params, iterations=60, sparing=False)
     got = problem.state(solution.params)["gain"].T.ravel()
     # exp is linear to a hundredth, and the map rounded to 1e-4 of its change: flat directions of F show it.
     least = ((jacobian @ expected - by_channel) ** 2).sum() / sigma**2 + expected @ precision @ expected
@@ -415,7 +424,7 @@ def test_linear_problem_has_its_closed_solution(rng, monkeypatch):
     assert np.linalg.norm(got - expected) < 0.04 * np.linalg.norm(expected)
     assert solution.history[-1]["loss"] == pytest.approx(least, rel=2e-3)
     # As noise would let steps do: what is asked for is noise.
-    kept = solve(problem, params, sigma, iterations=60)
+    kept = solve(problem, params, iterations=60)
     assert kept.note and not problem.state(kept.params)["gain"].any()
     without = np.linalg.lstsq(jacobian, by_channel, rcond=None)[0]
     assert np.linalg.norm(without - expected) > 0.1 * np.linalg.norm(expected)  # the prior has its say
@@ -463,7 +472,7 @@ def followed(problem, params, **options):
     solution = solve(problem, params, after_step=note, **options)
     start = problem.state(params)
     before, scale = problem.evaluate(start), np.inf
-    sigma = options.get("sigma", SIGMA)
+    sigma = problem.likelihood.least_noise
     for row, point in zip(solution.history, points, strict=False):
         f, earlier = (
             problem.likelihood.misfit(one.residual, row["sigma"]) + problem.penalty(one.state, start)
@@ -484,12 +493,13 @@ def followed(problem, params, **options):
 
 def test_scale_is_that_of_the_residual_and_falls_by_half_at_most(case):
     problem, params, start, _ = case
-    solution, last = followed(problem, params, sigma=0.05, iterations=30)
+    problem = known_to(problem, 0.05)
+    solution, last = followed(problem, params, iterations=30)
     scales = [row["sigma"] for row in solution.history]
     residual = problem.evaluate(start).residual
-    assert scales[0] == problem.likelihood.noise(residual, 0.05)
+    assert scales[0] == problem.likelihood.noise(residual)
     assert all(b >= a / 2 * (1 - 1e-12) for a, b in zip(scales, scales[1:], strict=False))
-    assert scales[-1] == pytest.approx(problem.likelihood.noise(last.residual, 0.05), rel=0.02)
+    assert scales[-1] == pytest.approx(problem.likelihood.noise(last.residual), rel=0.02)
 
 
 def test_a_step_that_raises_f_is_damped(case, monkeypatch):
@@ -503,7 +513,7 @@ def test_a_step_that_raises_f_is_damped(case, monkeypatch):
         return {name: state[name] + times * (found[name] - state[name]) for name in found}
 
     monkeypatch.setattr(Problem, "step", far)
-    solution, _ = followed(problem, params, sigma=0.1)
+    solution, _ = followed(known_to(problem, 0.1), params)
     assert len(dampings) > len(solution.history) > 1 and max(dampings) >= 0.5
     rises = [b / a for a, b in zip(dampings, dampings[1:], strict=False) if b > a]
     assert rises and min(rises) >= 10 * (1 - 1e-9)
@@ -687,7 +697,7 @@ def test_steps_to_what_is_not_finite_are_not_taken(case, monkeypatch):
         return found
 
     monkeypatch.setattr(Problem, "step", spoiled)
-    solution, last = followed(problem, params, sigma=0.05)
+    solution, last = followed(known_to(problem, 0.05), params)
     assert len(solution.history) > 1 and len(calls) > len(solution.history)
     assert last.residual is not None
 
@@ -698,7 +708,8 @@ def test_steps_to_what_is_not_finite_are_not_taken(case, monkeypatch):
 def searched(image, transport, target):
     """Return the problem, the likeliest explanation, and its lights."""
     problem, params = problem_of(image, transport, target)
-    found = search.search(problem, problem.state(params), 0.01)
+    problem = known_to(problem, 0.01)
+    found = search.search(problem, problem.state(params))
     return problem, found, problem.shining(found.run.state)
 
 
@@ -718,7 +729,7 @@ def test_the_maps_light_moves_where_no_step_leads(rng):
     problem, found, _ = searched(image + lamp(), transport, target)
     assert degrees_off(problem, found.run.state, place) < 8  # half a texel
     problem, params = problem_of(image + lamp(), transport, target)
-    alone = problem.state(solve(problem, params, 0.01).params)
+    alone = problem.state(solve(known_to(problem, 0.01), params).params)
     assert degrees_off(problem, alone, place, 0) > 20
 
 
@@ -742,7 +753,7 @@ def test_a_near_start_stays_unless_path_tracing_says_that_the_solution_is_closer
         asked.append(envmap)
         return errors[len(asked) - 1]
 
-    found = solve(problem, params, 0.02, judge=judge)
+    found = solve(known_to(problem, 0.02), params, judge=judge)
     assert stays == (not problem.state(found.params)["gain"].any())
     np.testing.assert_array_equal(asked[0], image)
     assert len(asked) == 2 and ("path-traced" in found.note) == stays
@@ -943,13 +954,13 @@ def saturating(rng, kept):
 
 def test_saturation_of_the_target_is_found(rng):
     problem, params = saturating(rng, 0.3)
-    found = solve(problem, params, sigma=0.002)
+    found = solve(known_to(problem, 0.002), params)
     kept = np.exp(found.params["saturation"].numpy()[0, 0])
     assert kept == pytest.approx(0.3, abs=0.05)
     assert np.abs(found.params["gain.0"].numpy()).max() < 0.1
     # Without the unknown a gain has to make up for it.
     problem.saturates = False
-    other = solve(problem, params, sigma=0.002)
+    other = solve(known_to(problem, 0.002), params)
     assert "saturation" not in other.params
     assert other.history[-1]["loss"] > 2 * found.history[-1]["loss"]
 

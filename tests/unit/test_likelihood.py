@@ -1,13 +1,16 @@
 """How likely residuals are: independent values, the most likely noise, the mean of what was not painted."""
 
+from dataclasses import replace
+
 import mitsuba as mi
 import numpy as np
 import pytest
 
 from envedit.losses import display_curve
 from envedit.solve import likelihood
-from envedit.solve.likelihood import INDEPENDENT, PAINT_NOISE, STATEMENTS, VISIBLE, Likelihood
+from envedit.solve.likelihood import INDEPENDENT, PAINT_NOISE, SIGMA, STATEMENTS, VISIBLE, Likelihood
 from envedit.targets.pixel_weights import pixel_weight
+from envedit.targets.target import Target
 
 FILM = (20, 24)
 
@@ -77,18 +80,26 @@ def test_the_mean_is_scaled_to_have_the_gradient_of_its_loss(change):
 
 def test_noise_of_squares_is_the_most_likely(rng):
     """No other sigma makes the residual likelier, and its square is the weighted mean square."""
-    one, _ = of_stroke()
+    one = replace(of_stroke()[0], least_noise=1e-3)
     residual = rng.normal(0, 0.05, (*FILM, 3))
-    found = one.noise(residual, 1e-3)
+    found = one.noise(residual)
     assert found == pytest.approx(np.sqrt((one.weight * residual**2).mean()), rel=1e-5)
 
     def unlikeliness(sigma):
         return one.misfit(residual, sigma) + 6 * one.independent * np.log(sigma)
 
-    assert one.at_best(residual, 1e-3) == pytest.approx(unlikeliness(found), rel=1e-9)
+    assert one.at_best(residual) == pytest.approx(unlikeliness(found), rel=1e-9)
     assert min(unlikeliness(found * factor) for factor in (0.5, 0.95, 1.05, 2)) > unlikeliness(found)
     # What is known is not undercut.
-    assert one.noise(residual, 0.5) == 0.5 and one.noise(0 * residual, 0.01) == 0.01
+    assert replace(one, least_noise=0.5).noise(residual) == 0.5
+    assert one.noise(0 * residual) == 1e-3
+
+
+@pytest.mark.parametrize(("noise", "least"), [(None, SIGMA), (0.001, SIGMA), (0.03, 0.03)])
+def test_display_values_are_known_to_the_noise_of_the_target(noise, least):
+    picture = np.full((*FILM, 3), 0.5, np.float32)
+    of_pixels = None if noise is None else np.full(FILM, noise)
+    assert Likelihood.of_target(Target(picture, None, None, "", noise=of_pixels)).least_noise == least
 
 
 def test_noise_of_paint_is_at_most_a_share_of_the_change_that_is_seen():
@@ -97,14 +108,14 @@ def test_noise_of_paint_is_at_most_a_share_of_the_change_that_is_seen():
     shown = display_curve.to_display(mi.TensorXf([0.2, 0.5])).numpy()
     most = pytest.approx(PAINT_NOISE * (shown[1] - shown[0]), rel=1e-5)
     residual = np.full((*FILM, 3), 0.5)
-    assert one.noise(residual, 1e-3) == most
-    assert one.at_best(residual, 1e-3) == pytest.approx(
+    assert one.noise(residual) == most
+    assert one.at_best(residual) == pytest.approx(
         one.misfit(residual, one.paint_noise) + 6 * one.independent * np.log(one.paint_noise), rel=1e-9
     )
     all_painted = np.ones_like(coverage)
-    assert Likelihood.of_paint(all_painted, all_painted, *pictures(coverage)).noise(residual, 1e-3) == most
+    assert Likelihood.of_paint(all_painted, all_painted, *pictures(coverage)).noise(residual) == most
     nothing = Likelihood.of_paint(one.weight, coverage, *pictures(coverage, 0.2, 0.2))
-    assert nothing.noise(residual, 1e-3) == pytest.approx(PAINT_NOISE * VISIBLE)
+    assert nothing.noise(residual) == pytest.approx(PAINT_NOISE * VISIBLE)
 
 
 @pytest.mark.parametrize(("before", "white"), [(0.0, 1.0), (0.2, 1.0), (4.0, 4.0)])
@@ -122,11 +133,11 @@ def test_white_is_what_most_of_the_picture_was_below_and_at_least_one(before, wh
 
 @pytest.mark.parametrize("film", [(6, 8), FILM, (64, 64)])
 def test_noise_with_hubers_loss_makes_the_misfit_that_of_independent_values(film, rng):
-    one = Likelihood(likelihood.on_average_one(None, film))
+    one = Likelihood(likelihood.on_average_one(None, film), least_noise=1e-4)
     residual = rng.normal(0, 0.03, (*film, 3)) * np.where(rng.random((*film, 1)) < 0.1, 20, 1)
-    found = one.noise(residual, 1e-4)
+    found = one.noise(residual)
     assert one.misfit(residual, found) == pytest.approx(3 * INDEPENDENT, rel=1e-6)
-    assert one.noise(4 * residual, 1e-4) == pytest.approx(4 * found)
+    assert one.noise(4 * residual) == pytest.approx(4 * found)
 
 
 @pytest.mark.parametrize("rows", [1, 5, 19, 20])

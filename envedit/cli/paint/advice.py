@@ -16,7 +16,6 @@ from envedit.core.rotations import rotation_vector
 from envedit.representations.layers.lights import DARK
 from envedit.solve import painted_places
 from envedit.solve.feasibility import WARNED_SHARE, Reach
-from envedit.solve.likelihood import SIGMA
 from envedit.solve.map_problem import Problem
 from envedit.solve.unknowns import with_light
 
@@ -175,7 +174,7 @@ def _best(problem, without, start, k, request, away=None):
     """
     lights = problem.layers.lights
     most: tuple[float, painted_places.Place | None] = 0.0, None
-    for there in painted_places.best(problem, without, k, SIGMA, away):
+    for there in painted_places.best(problem, without, k, away):
         turn = rotation_vector(lights.centres[k], there.direction)
         size = start["size"][k] if k < lights.own else lights.log_size(there.degrees)
         placed = with_light(start, k, turn=turn, flux=there.log_flux, size=size)

@@ -25,7 +25,7 @@ from envedit.representations.layers.placed_lights import PlacedLights
 from envedit.representations.layers.unseen import unseen_kept
 from envedit.scene.scene import Scene
 from envedit.solve import gauss_newton, hold, map_problem, prior, search
-from envedit.solve.likelihood import SIGMA, Likelihood
+from envedit.solve.likelihood import Likelihood
 from envedit.targets import strokes
 from envedit.targets.pixel_weights import first_hold, hidden_pixels, pixel_weight
 from envedit.targets.target import painted_strokes
@@ -201,7 +201,7 @@ class Solution:
         A light that jumps, or that is added, is where no small step leads. ``unless_newer`` is called now and
         then; what it raises ends the search.
         """
-        now = search.score(self.problem, self.run, self.point, SIGMA)
+        now = search.score(self.problem, self.run, self.point)
         found = search.search(self.problem, self.still, after_step=unless_newer)
         self.searched = True
         if found.score < now:

@@ -49,7 +49,7 @@ class Run:
     hold: float = 1.0  # weight of what was not painted, where it is raised (:mod:`.hold`)
     # Derivatives by a light's direction are wide differences: with narrow ones no step leads further
     wide: bool = False
-    corrected: bool = False  # the last steps, towards a target without T's error (:mod:`.transport_error`)
+    corrected: bool = False  # the last steps, towards a target without T's error (:mod:`.layers_solver`)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return all but the history as arrays, for a checkpoint."""

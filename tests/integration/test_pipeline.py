@@ -21,7 +21,8 @@ from envedit.losses.perceptual import installed
 from envedit.representations.layers import gain
 from envedit.representations.layers.placed_lights import angles, direction
 from envedit.scene import scene
-from envedit.solve import checkpoint, gauss_newton, likelihood, search, transport_error
+from envedit.solve import checkpoint, gauss_newton, likelihood, search
+from envedit.targets.target import Target
 from envedit.transport import recording
 from envedit.transport.light_transport import LightTransport
 from tests.oracles.builders import BALL, LIGHT, SENSOR, sky, write_scene
@@ -779,6 +780,6 @@ def test_the_map_does_not_make_up_for_what_the_transport_misses(monkeypatch):
         "output": {"spp": 1024},
     }
     psnr = api.edit(settings, envmap=before, target_map=after).metrics["render"]["psnr"]
-    monkeypatch.setattr(transport_error, "corrected", lambda wanted, *_: wanted)
+    monkeypatch.setattr(Target, "seen_as", lambda wanted, *_: wanted)
     without = api.edit(settings, envmap=before, target_map=after).metrics["render"]["psnr"]
     assert psnr > without + 0.5  # 0.7 to 3 dB in nine of nine such edits

@@ -84,7 +84,7 @@ class MovedLights:
         centre = _opaque(mi.Vector3f, self.layers.lights.centres[light])
         turn = _opaque(mi.Vector3f, self.turn[light])
         sine = flat(mi.Float, np.sin(np.pi * row / max(self.height - 1, 1)).astype(np.float32)) * size
-        places = lights.placed(point, centre, turn, size, sine, 1.0, (self.height, self.width))
+        places = lights.placed(point, centre, turn, size, sine, (self.height, self.width))
         dr.eval(places)
         reach = places[0].numpy()
         first, last = int(np.floor(reach.min() - half_row)), int(np.ceil(reach.max() + half_row))

@@ -72,8 +72,8 @@ def place(made, turn=0.0, flux=0.0, size=0.0):
     return single(turn), single(flux), single(size)
 
 
-def core(made, *at, shape=(H, W), rows=None, **where):
-    return made.core(*(at or place(made, **where)), shape, rows or (0, shape[0])).numpy()
+def core(made, *at, shape=(H, W), **where):
+    return made.core(*(at or place(made, **where)), shape).numpy()
 
 
 def second_moments(image, centre):
@@ -85,24 +85,24 @@ def second_moments(image, centre):
     return (np.square(away) * share).sum(axis=(1, 2)) / share.sum()
 
 
-def plain_core(light, turn, flux=0.0, size=0.0, shape=(H, W), of=(H, W)):
-    """The core of one light of a map ``of`` some size, in float64 and without snapping."""
-    (height, width), (old_height, old_width) = shape, of
-    row, column = np.divmod(light.texels, old_width)
-    points = latlong.directions(*of)[row, column]
-    power = light.radiance * latlong.lookup_solid_angles(*of)[row][:, None] * np.exp(flux)
+def plain_core(light, turn, flux=0.0, size=0.0, shape=(H, W)):
+    """The core of one light of a map, in float64 and without snapping."""
+    height, width = shape
+    row, column = np.divmod(light.texels, width)
+    points = latlong.directions(*shape)[row, column]
+    power = light.radiance * latlong.lookup_solid_angles(*shape)[row][:, None] * np.exp(flux)
     along = (points @ light.direction)[:, None] * light.direction
     points = along + (points - along) * np.exp(size)
     points = turned(turn, points / np.linalg.norm(points, axis=1, keepdims=True))
     y, x = latlong.texel_position(points, height, width)
-    sine = np.sin(np.pi * row / (old_height - 1)) * np.exp(size) * width / old_width
+    sine = np.sin(np.pi * row / (height - 1)) * np.exp(size)
     half = np.clip(sine / np.maximum(np.hypot(points[:, 0], points[:, 2]), 1e-9), 1, 2 * width)
 
     def tents(k, at, half):
         share = np.maximum(1 - np.abs(k - at[:, None]) / half, 0)
         return share / share.sum(axis=1, keepdims=True)
 
-    down = tents(np.arange(height), y, max(1.0, (height - 1) / (old_height - 1)))
+    down = tents(np.arange(height), y, 1.0)
     across = tents(np.arange(-3 * width, 4 * width), x, half[:, None]).reshape(-1, 7, width).sum(axis=1)
     lit = np.einsum("nr,nc,nk->rck", down, across, power)
     return lit / latlong.lookup_solid_angles(*shape)[:, None, None]
@@ -191,8 +191,9 @@ def test_turn_by_whole_texels_is_a_roll(top, columns, rng):
 
 @pytest.mark.parametrize("shape", [(H, W), (49, 96), (13, 24), (30, 50), (7, 9)])
 def test_core_is_the_plain_one(shape, rng):
-    light = patch(rng, 6, 46)
-    made = Lights([light], (0, H), W)
+    height, width = shape
+    light = patch(rng, height // 4, width - 2, shape=shape)
+    made = Lights([light], (0, height), width)
     for size in np.linspace(-3, 1, 10):
         turn, flux = random_turn(rng), rng.normal(size=3)
         expected = plain_core(light, turn, flux, size, shape)
@@ -212,7 +213,7 @@ def test_cores_of_one_light_are_those_of_all_with_the_others_out(rng):
         for one, (turn, flux, size) in zip(found, ways, strict=True):
             at = [np.zeros((made.count, n)) for n in (3, 3, 1)]
             at[0][i], at[1][:], at[1][i], at[2][i] = turn, DARK, flux, size
-            alone = made.core(*(mi.TensorXf(np.float32(v)) for v in at), (H, W), (0, H)).numpy()
+            alone = made.core(*(mi.TensorXf(np.float32(v)) for v in at), (H, W)).numpy()
             np.testing.assert_allclose(one, alone, rtol=3e-6, atol=1e-5)
 
 
@@ -240,11 +241,11 @@ def test_flux_is_kept_anywhere_on_the_sphere(top, rng):
 
 def test_rows_that_are_not_wanted_lose_their_flux_and_nothing_else(rng):
     light = patch(rng, 4, 10, rows=6)
-    made = Lights([light], (0, H), W)
     for turn in (np.zeros(3), random_turn(rng), centred_at(light, 0.2, 3.1)):
-        whole = core(made, turn=turn)
-        for first, last in [(0, 7), (6, 9), (3, H), (20, 25)]:
-            part = core(made, turn=turn, shape=(last - first, W), rows=(first, H))
+        whole = core(Lights([light], (0, H), W), turn=turn)
+        for first, last in [(0, 7), (2, 9), (3, H), (4, 25)]:
+            of_rows = dataclasses.replace(light, texels=light.texels - first * W)
+            part = core(Lights([of_rows], (first, H), W), turn=turn, shape=(last - first, W))
             np.testing.assert_allclose(part, whole[first:last], rtol=1e-6, atol=1e-8)
 
 
@@ -252,25 +253,28 @@ def test_light_of_rows_of_a_map_is_that_of_the_map(rng):
     light = patch(rng, 8, 10)
     part = Light(light.direction, light.texels - 5 * W, light.radiance, None)
     turn = random_turn(rng)
-    whole, of_rows = (core(Lights([x], (f, H), W), turn=turn) for x, f in ((light, 0), (part, 5)))
-    np.testing.assert_array_equal(whole, of_rows)
+    whole = core(Lights([light], (0, H), W), turn=turn)
+    of_rows = core(Lights([part], (5, H), W), turn=turn, shape=(H - 5, W))
+    np.testing.assert_array_equal(whole[5:], of_rows)
 
 
 def test_a_spare_light_can_have_a_colour_that_no_light_has(rng):
     light = patch(rng, 4, 10)
-    made = Lights([dataclasses.replace(light, radiance=light.radiance * [1, 0, 0])], (0, H), W)
+    red = dataclasses.replace(light, radiance=light.radiance * [1, 0, 0])
+    made = Lights([red], (0, H), W)
     assert (made.flux[0] > 0).tolist() == [True, False, False]
     turn, flux, size = (np.array(p) for p in place(made, flux=DARK))
     flux[1] = np.log(made.flux[1, 0] / made.flux[1])
-    got = maps.flux(core(made, single(turn), single(flux), single(size), shape=(64, 128)))
+    got = maps.flux(core(made, single(turn), single(flux), single(size)))
     np.testing.assert_allclose(got, made.flux[0, 0], rtol=1e-4)
 
 
 def test_spare_lights_are_lobes_with_the_mean_flux(rng):
-    both = [patch(rng, 4, 10), patch(rng, 15, 40)]
+    shape = (64, 128)
+    both = [patch(rng, 4, 10, shape=shape), patch(rng, 15, 40, shape=shape)]
     for own in (both, both[:1], []):
-        made = Lights(own, (0, H), W)
-        fluxes = [maps.flux(image_of(light)) for light in own] or [np.ones(3)]
+        made = Lights(own, (0, 64), 128)
+        fluxes = [maps.flux(image_of(light, shape)) for light in own] or [np.ones(3)]
         turn, flux, size = (np.array(p) for p in place(made, flux=DARK))
         assert made.count == len(own) + SPARE
         for i in range(SPARE):
@@ -279,7 +283,7 @@ def test_spare_lights_are_lobes_with_the_mean_flux(rng):
             for _ in range(5):
                 goal = unit(rng)
                 turn[len(own) + i] = rotation_vector(UP, goal)
-                got = core(made, single(turn), single(flux), single(size), shape=(64, 128))
+                got = core(made, single(turn), single(flux), single(size), shape=shape)
                 np.testing.assert_allclose(maps.flux(got), np.mean(fluxes, axis=0), rtol=1e-5)
                 near = maps.angle(latlong.directions(64, 128), goal) < 4 * LOBE_DEGREES + 2 * 180 / 64
                 assert (maps.flux(got, near) > 0.9 * maps.flux(got)).all()
@@ -408,7 +412,7 @@ def test_gradient_is_the_finite_difference(kind, top, rng):
             continue
         seen += 1
         grads, value = derivatives(
-            lambda *p: loss_of(made.core(*p, (H, W), (0, H)), kind),
+            lambda *p: loss_of(made.core(*p, (H, W)), kind),
             *place(made, turn=at[:3], flux=at[3:6], size=at[6]),
         )
         np.testing.assert_allclose(value, here, rtol=1e-3)
@@ -438,7 +442,7 @@ def test_gradient_along_a_path_adds_up_to_the_change(name, rng):
     start, end = over(light, name)
     turns = start + (end - start) * ((np.arange(count) + 0.5) / count)[:, None]
     at = place(made := Lights([light] * count, (0, H), W), turn=turns)
-    (turn, _, _), _ = derivatives(lambda *p: weighted(made.core(*p, (H, W), (0, H)), weight), *at)
+    (turn, _, _), _ = derivatives(lambda *p: weighted(made.core(*p, (H, W)), weight), *at)
     slopes = turn[:count] @ (end - start)
     alone = Lights([light], (0, H), W)
     low, high = ((core(alone, turn=v) * weight).sum() for v in (start, end))
@@ -451,10 +455,10 @@ def test_gradients_of_lights_do_not_mix(rng):
     made = Lights(both, (0, H), W)
     where = {"turn": np.array([[0.11, 0.03, 0.07], [-0.05, 0.13, 0.02]]), "size": np.array([[0.1], [0.2]])}
     upper = weights() * (np.arange(H) < 12)[:, None, None]
-    grads, _ = derivatives(lambda *p: weighted(made.core(*p, (H, W), (0, H)), upper), *place(made, **where))
+    grads, _ = derivatives(lambda *p: weighted(made.core(*p, (H, W)), upper), *place(made, **where))
     alone = Lights(both[:1], (0, H), W)
     expected, _ = derivatives(
-        lambda *p: weighted(alone.core(*p, (H, W), (0, H)), upper),
+        lambda *p: weighted(alone.core(*p, (H, W)), upper),
         *place(alone, **{name: value[0] for name, value in where.items()}),
     )
     for got, one in zip(grads, expected, strict=True):
@@ -468,7 +472,7 @@ def test_gradient_of_an_unmoved_light_has_the_direction_of_the_change(rng):
     light = patch(rng, 11, 20)
     made = Lights([light], (0, H), W)
     weight = weights() * latlong.lookup_solid_angles(H, W)[:, None, None]
-    (turn, _, _), _ = derivatives(lambda *p: weighted(made.core(*p, (H, W), (0, H)), weight), *place(made))
+    (turn, _, _), _ = derivatives(lambda *p: weighted(made.core(*p, (H, W)), weight), *place(made))
     ends = [[(plain_core(light, v) * weight).sum() for v in 0.02 * sign * np.eye(3)] for sign in (1, -1)]
     slope = (np.array(ends[0]) - ends[1]) / 0.04
     assert turn[0] @ slope > 0.98 * np.linalg.norm(turn[0]) * np.linalg.norm(slope)
@@ -480,7 +484,7 @@ def test_gradient_at_a_pole_is_finite(goal, rng):
     light = patch(rng, 8, 20, rows=1, columns=1)
     made = Lights([light], (0, H), W)
     at = place(made, turn=rotation_vector(light.direction, goal))
-    grads, value = derivatives(lambda *p: weighted(made.core(*p, (H, W), (0, H)), weights()), *at)
+    grads, value = derivatives(lambda *p: weighted(made.core(*p, (H, W)), weights()), *at)
     assert np.isfinite(value) and all(np.isfinite(g).all() for g in grads)
 
 

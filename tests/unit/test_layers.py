@@ -198,7 +198,7 @@ def test_moving_a_light_without_a_glow_leaves_the_background(end):
     assert not made.lights.glowing
     p = sent(made, params, latlong.directions(*SHAPE)[end])
     real = [p[name] * layers.SCALES[name] for name in ("turn", "flux", "size")]
-    core, got = made.lights.core(*real, SHAPE, (0, SHAPE[0])).numpy(), made.decode(p).numpy()
+    core, got = made.lights.core(*real, SHAPE).numpy(), made.decode(p).numpy()
     away = (core == 0).all(axis=2) & ~core_of(made)
     assert away.mean() > 0.9 and core[end].max() > 100
     np.testing.assert_array_equal(got[away], image[away])

@@ -219,7 +219,7 @@ class Layers:
         return mi.TensorXf(sky, (*self.whole, 3)), core
 
     def _core(self, real):
-        core = self.lights.core(real["turn"], real["flux"], real["size"], self.whole, self.rows)
+        core = self.lights.core(real["turn"], real["flux"], real["size"], self.whole)
         if self.kept is not None:
             share, own_core = self._kept_core
             core = share * own_core + (1 - share) * core
@@ -229,7 +229,7 @@ class Layers:
     def _kept_core(self):
         """How far cores are kept, (rows, W, 3), and what they are of unmoved lights."""
         real = self._real(self.start())
-        core = self.lights.core(real["turn"], real["flux"], real["size"], self.whole, self.rows)
+        core = self.lights.core(real["turn"], real["flux"], real["size"], self.whole)
         return tensor(np.repeat(self.kept[..., None], 3, axis=2)), tensor(core.numpy())
 
     def _above(self, real, fields=None):

@@ -169,33 +169,28 @@ class Lights:
         log_flux: mi.TensorXf,
         log_size: mi.TensorXf,
         shape: tuple[int, int],
-        rows: tuple[int, int],
     ) -> mi.TensorXf:
         """Render the cores: linear radiance (rows, W, 3); what falls on rows that are not wanted is lost.
 
         ``turn`` (count, 3) are rotation vectors, axis times angle in radians, from where the light was;
         ``log_flux`` (count, 3) and ``log_size`` (count, 1) are logarithms of flux and size over what they
-        were. Wanted are the rows and columns of ``shape``; ``rows`` are the first of them in the map, and the
-        rows of the map, at that resolution.
+        were. ``shape`` has the rows and columns wanted, from the first row that the lights were given for.
         """
         centre = dr.gather(mi.Vector3f, self._centre, self._which)
         size = dr.exp(dr.clip(dr.matmul(self._owner, log_size).array, *LOG_SIZES))
         turn = dr.unravel(mi.Vector3f, dr.matmul(self._owner, turn).array)
         flux = self._flux * _exp(dr.unravel(mi.Color3f, dr.matmul(self._owner, log_flux).array))
         wide = _widths(self._sine * size, self._added)
-        finer = shape[1] / self.width
-        half_row = max(1.0, (rows[1] - 1) / max(self.total - 1, 1))
-        row, column, half = placed(self._point, centre, turn, size, wide, finer, (rows[1], shape[1]))
-        return shared_out(row, column, half, flux, half_row, shape, rows)
+        row, column, half = placed(self._point, centre, turn, size, wide, (self.total, self.width))
+        return shared_out(row, column, half, flux, 1.0, shape, self._rows)
 
     def cores_of(
         self, i: int, placements: Sequence[tuple[np.ndarray, np.ndarray, float]], shape: tuple[int, int]
     ) -> np.ndarray:
         """Render the core of light ``i`` alone as it is placed in one way and another, (k, rows, W, 3).
 
-        ``placements`` are turn, log flux and log size, as of :meth:`core`; ``shape`` has the rows and columns
-        wanted, from the first row that the lights were given for, at their resolution. Linear radiance; not
-        differentiable.
+        ``placements`` are turn, log flux and log size, as of :meth:`core`, as is ``shape``. Linear radiance;
+        not differentiable.
         """
         # ---- Every point of the light once for each placement
         first, count = self._points_of[i]
@@ -216,7 +211,7 @@ class Lights:
         wide = _widths(wide, dr.gather(mi.Bool, self._added, point))
 
         # ---- One image for each placement
-        row, column, half = placed(position, centre, turn, size, wide, 1.0, (self.total, shape[1]))
+        row, column, half = placed(position, centre, turn, size, wide, (self.total, self.width))
         cores = shared_out(row, column, half, flux, 1.0, shape, self._rows, mi.Int32(page), pages)
         return cores.numpy().reshape(-1, *shape, 3)
 
@@ -251,7 +246,6 @@ def placed(
     turn: mi.Vector3f,
     size: mi.Float,
     wide: mi.Float,
-    finer: float,
     grid: tuple[int, int],
 ) -> tuple[mi.Float, mi.Float, mi.Float]:
     """Return where points of lights come to lie: row, column and half-width in columns, each Float (n,).
@@ -259,7 +253,7 @@ def placed(
     Of each point (n,) there are its direction, the centre and the rotation vector of its light, the light's
     size over what it was, and the width that it is to have, ``wide``, in columns at the equator: size times
     the sine of the polar angle of the texel that it came from. ``grid`` are rows and columns of the whole
-    map, and ``finer`` its columns over those of the map that the points came from.
+    map.
     """
     total, width = grid
     along = dr.dot(point, centre)
@@ -271,7 +265,7 @@ def placed(
     column = dr.atan2(d.x, -d.z) * dr.opaque(mi.Float, width / (2 * math.pi)) - 0.5
     snap = max(SNAP_TEXELS, SNAP_SHARE * width)
     row, column = _snapped(row, snap), _snapped(column, snap)
-    half = dr.clip(wide / across * finer, 1, MOST_HALF_WIDTH * width)
+    half = dr.clip(wide / across, 1, MOST_HALF_WIDTH * width)
     half = dr.select(half < 1 + 1e-5, 1, half)  # a tent that is wider by rounding would reach neighbours
     return row, column, half
 

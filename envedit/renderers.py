@@ -12,7 +12,7 @@ from envedit.core.errors import ConfigError
 from envedit.core.types import Progress
 from envedit.scene.path_tracer import PathTracer
 from envedit.scene.scene import Scene
-from envedit.transport import recording
+from envedit.transport import sampling_plan
 from envedit.transport.light_transport import LightTransport
 
 
@@ -65,7 +65,9 @@ def check(settings: config.Config, scene: Scene, shape: tuple[int, int]) -> None
             "set it, or [scene] sensors to one of them"
         )
     if chosen.kind == "transport":
-        recording.choose_samples(scene, chosen.spp, shape[0] * shape[1], recording.allowed(chosen.memory_gb))
+        sampling_plan.choose_samples(
+            scene, chosen.spp, shape[0] * shape[1], sampling_plan.allowed(chosen.memory_gb)
+        )
 
 
 def trace(

@@ -20,7 +20,7 @@ from envedit.representations.layers.layers import Layers
 from envedit.scene.scene import Scene
 from envedit.solve import gain_bandwidth, pixel_confidence
 from envedit.targets.target import Target
-from envedit.transport import recording
+from envedit.transport import sampling_plan
 from envedit.transport.light_transport import LightTransport
 
 SECOND_SPP, SECOND_COLUMNS = 32, 64
@@ -76,7 +76,7 @@ def recordings(
         Seeds(settings.seed).second_recording,
         spp=few,
         max_depth=transport.bounces + 1,
-        memory_gb=recording.gigabytes(pixels, few, min(SECOND_COLUMNS, transport.capacity) + 1),
+        memory_gb=sampling_plan.gigabytes(pixels, few, min(SECOND_COLUMNS, transport.capacity) + 1),
         refresh=0,
     )
     octaves = gain_bandwidth.octaves(
@@ -92,7 +92,7 @@ def recordings(
     least = f"below {100 * gain_bandwidth.MIRRORED_SHARE:.0f} % at {2 * CYCLES} cycles"
     notes = [f"sky area with identifiable detail: {shares or least}"]
     if octaves and traced and settings.renderer.spp == "auto":
-        most = recording.most_samples(pixels, recording.allowed(settings.renderer.memory_gb))
+        most = sampling_plan.most_samples(pixels, sampling_plan.allowed(settings.renderer.memory_gb))
         if most > transport.spp:
             notes.append(
                 f"{most} paths a pixel instead of {transport.spp}, for less noise in the identifiable detail"

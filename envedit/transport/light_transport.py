@@ -38,11 +38,11 @@ from envedit.core.types import ArrayLike, Progress
 from envedit.scene import built_scene
 from envedit.scene.scene import Scene
 from envedit.transport import block_transport as overviews
-from envedit.transport import bright_texels
+from envedit.transport import bright_texels, sampling_plan
 from envedit.transport.exact_columns import ExactColumns
 from envedit.transport.influence import determined
-from envedit.transport.recording import allowed, other_light, record_all
-from envedit.transport.sampling_plan import COLUMN_PATHS, FEW_PATHS, SamplingPlan, choose, white_sky
+from envedit.transport.recording import other_light, record_all
+from envedit.transport.sampling_plan import COLUMN_PATHS, FEW_PATHS, SamplingPlan
 from envedit.transport.sparse_matrix import ColourMatrix, scale_packets, to_packets
 from envedit.transport.texel_sampling import Grid
 
@@ -143,7 +143,7 @@ class LightTransport:
             Texel samples a pixel of the coarse tier.
         max_depth : int or "auto"
             Mitsuba's path depth (1: sky seen directly, 2: direct light). "auto" stops where further
-            bounces add less than :data:`.recording.DEPTH_TOLERANCE` of the picture under a white sky.
+            bounces add less than :data:`.sampling_plan.DEPTH_TOLERANCE` of the picture under a white sky.
         seed : int
             Seed of the recording.
         memory_gb : float or "auto"
@@ -176,7 +176,7 @@ class LightTransport:
             mi.set_variant("llvm_ad_rgb")
         scene = built_scene.load(scene, config.Scene())
         latlong.check_envmap_size(height, width)
-        memory_gb = allowed(memory_gb)
+        memory_gb = sampling_plan.allowed(memory_gb)
         for name, value in (("spp", spp), ("max_depth", max_depth)):
             whole = isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= 1
             if value != "auto" and not whole:
@@ -192,8 +192,9 @@ class LightTransport:
             "grid": [height, width, np.asarray(scene.to_world).tolist()],
             "seed": seed,
         }
-        light = white_sky(cache, origin | {"part": "pilot"}, scene, (height, width), seed)
-        plan = choose(scene, (height, width), light, spp, max_depth, memory_gb, few)
+        grid = height, width
+        light = sampling_plan.white_sky(cache, origin | {"part": "pilot"}, scene, grid, seed)
+        plan = sampling_plan.choose(scene, grid, light, spp, max_depth, memory_gb, few)
         transport = cls(scene, Grid(height, width, scene.to_world, plan.mass), plan, seed, refresh)
 
         # ---- The recording, from disk or traced

@@ -23,7 +23,7 @@ from envedit.representations.layers.placed_lights import angles, direction
 from envedit.scene import scene
 from envedit.solve import checkpoint, gauss_newton, likelihood, search
 from envedit.targets.target import Target
-from envedit.transport import recording
+from envedit.transport import sampling_plan
 from envedit.transport.light_transport import LightTransport
 from tests.oracles.builders import BALL, LIGHT, SENSOR, sky, write_scene
 from tests.oracles.matrix_renderer import without_times
@@ -473,8 +473,8 @@ def detailed(rng):
 
 @pytest.mark.slow
 def test_a_mirror_gets_finer_grids_and_more_samples_and_goes_on_where_it_stopped(tmp_path, rng, monkeypatch):
-    monkeypatch.setattr(recording, "PATHS", 32 * 48**2)
-    monkeypatch.setattr(recording, "MOST_SPP", 128)
+    monkeypatch.setattr(sampling_plan, "PATHS", 32 * 48**2)
+    monkeypatch.setattr(sampling_plan, "MOST_SPP", 128)
     picture = detailed(rng)
     renderer = {"spp": "auto", "pixels": 36 * 32}  # detail is solved for on every pixel
     settings = settings_of(tmp_path, picture, target={"rotate_degrees": 90}, renderer=renderer, **MIRROR)

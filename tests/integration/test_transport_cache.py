@@ -7,7 +7,7 @@ import pytest
 
 from envedit.core.errors import InputError
 from envedit.scene import scene
-from envedit.transport import recording
+from envedit.transport import recording, sampling_plan
 from envedit.transport.light_transport import LightTransport
 from tests.oracles.builders import BALL, LIGHT, SENSOR, write_scene
 from tests.oracles.tiers import slow_but
@@ -110,7 +110,8 @@ def test_a_depth_that_was_chosen_is_the_same_as_one_that_was_asked_for(lamp, tmp
     depth = build(tmp_path, lit).bounces + 1
     asked = build(tmp_path, lit, max_depth=depth)
     assert asked.cached == (not lamp) and len(asked.choices) == 1
-    assert 0 < asked.depth_error <= recording.DEPTH_TOLERANCE < build(tmp_path, lit, max_depth=2).depth_error
+    short = build(tmp_path, lit, max_depth=2)
+    assert 0 < asked.depth_error <= sampling_plan.DEPTH_TOLERANCE < short.depth_error
 
 
 @pytest.mark.slow

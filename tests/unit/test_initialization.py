@@ -9,7 +9,7 @@ import pytest
 from envedit import config
 from envedit.solve import initialization
 from envedit.targets.target import Target
-from envedit.transport import recording
+from envedit.transport import sampling_plan
 
 SHAPE = (24, 32, 3)
 MAP = np.ones((8, 16, 3), np.float32)
@@ -125,7 +125,7 @@ def tracing(monkeypatch, octaves):
     def trace(settings, lit, shape, progress):
         asked.append((settings.seed, settings.renderer.spp))
         if settings.seed != 2**32 - 1:  # the second: as deep as T, and no larger than it must be
-            few = recording.gigabytes(lit.width * lit.height, settings.renderer.spp, 65)
+            few = sampling_plan.gigabytes(lit.width * lit.height, settings.renderer.spp, 65)
             assert settings.renderer.max_depth == 4 and settings.renderer.memory_gb == few
         return Traced(64 if settings.renderer.spp == "auto" else settings.renderer.spp)
 

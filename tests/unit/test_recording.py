@@ -9,7 +9,7 @@ import pytest
 
 from envedit.core.errors import InputError
 from envedit.scene import scene
-from envedit.transport import recording
+from envedit.transport import recording, sampling_plan
 from envedit.transport.light_transport import LightTransport
 from envedit.transport.texel_sampling import Grid
 from tests.oracles.scenes import WHITE, ball, stage
@@ -70,17 +70,17 @@ def left_out(transport):
 
 def test_depth_follows_the_light_by_bounce():
     s = scene.load("matte", 8, 8)
-    light = np.zeros(recording.MAX_BOUNCES + 1)
+    light = np.zeros(sampling_plan.MAX_BOUNCES + 1)
     light[:4] = 0.5, 0.4, 0.0985, 0.0015
-    bounces, (line,) = recording.choose_bounces(s, "auto", light)
+    bounces, (line,) = sampling_plan.choose_bounces(s, "auto", light)
     assert bounces == 2 and "depth 3" in line and "0.15 %" in line
-    assert recording.choose_bounces(s, 4, light) == (3, [])
+    assert sampling_plan.choose_bounces(s, 4, light) == (3, [])
     light[:] = 1
-    assert recording.choose_bounces(s, "auto", light)[0] == recording.MAX_BOUNCES
+    assert sampling_plan.choose_bounces(s, "auto", light)[0] == sampling_plan.MAX_BOUNCES
     light[:2] = 0
     for depth, where in ((2, " within path depth 2"), ("auto", "")):
         with pytest.raises(InputError, match=f"no pixel receives light from the environment{where}: check"):
-            recording.choose_bounces(s, depth, light * (depth == 2))
+            sampling_plan.choose_bounces(s, depth, light * (depth == 2))
 
 
 @pytest.mark.slow
@@ -94,7 +94,7 @@ def test_depth_error_is_the_share_of_a_rendering_without_bound():
     s = scene.load({"type": "scene", "sensor": sensor, "tube": tube, "sky": {"type": "constant"}})
     white = np.ones((4, 8, 3), np.float32)
     whole = s.render(white, spp=1024, max_depth=-1).mean(dtype=np.float64)
-    for asked, depth in (("auto", recording.MAX_BOUNCES + 1), (3, 3)):
+    for asked, depth in (("auto", sampling_plan.MAX_BOUNCES + 1), (3, 3)):
         t = LightTransport.build(s, 4, 8, spp=64, max_depth=asked, memory_gb=0.1)
         left = 1 - s.render(white, spp=1024, max_depth=depth).mean(dtype=np.float64) / whole
         assert left > 0.05 and t.depth_error == pytest.approx(left, abs=0.01)
@@ -107,7 +107,7 @@ def test_depth_error_is_the_share_of_a_rendering_without_bound():
 
 def test_rows_share_samples_by_their_light_and_none_gets_nothing():
     sphere = np.array([0.1, 0.4, 0.4, 0.1])
-    mass = recording.row_mass(sphere, np.array([0.4, 0.4, 0.0, 0.0]))
+    mass = sampling_plan.row_mass(sphere, np.array([0.4, 0.4, 0.0, 0.0]))
     assert (mass > 0).all()
     # Four times the light per solid angle: twice the samples per solid angle.
     assert mass[0] / sphere[0] == pytest.approx(2 * mass[1] / sphere[1])
@@ -120,7 +120,7 @@ def test_an_index_into_the_exact_columns_fits_into_32_bits(size):
     class Film:
         width = height = size
 
-    _, capacity, _ = recording.choose_samples(Film(), "auto", 256 * 128, 1e4)
+    _, capacity, _ = sampling_plan.choose_samples(Film(), "auto", 256 * 128, 1e4)
     assert 4 * (size * size + 7) * capacity < 2**32 and (capacity == 256 or size > 1024)
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -75,10 +75,7 @@ class Solution:
     """What :func:`solve` found."""
 
     params: dict  # of the layers
-    # A row a step: ``loss`` F, its parts ``data`` and ``prior``, the ``sigma`` at which they were taken,
-    # ``residual`` RMS of display values, ``damping``, ``step_ms``
-    history: list[dict]
-    run: Run  # as it ended
+    run: Run  # as it ended, also where the start was kept
     posterior: Posterior  # how well the picture determines the sky
     note: str = ""  # what a user should know
 
@@ -130,11 +127,9 @@ def solve(
     left = min(iterations, run.most) - len(run.history)
     point = descended(problem, run, point, left, after_step)
     normal = problem.curvature(point, run.start)
-    note = ""
-    whole = run
+    note, state = "", run.state
     first = problem.evaluate(start, resolve=False) if sparing and run.history else None
     if first is not None and first.residual is not None:
-        before = replace(run, state=start, start=start)
         loss = problem.unlikeliness(point, run.start) + 2 * normal.determined
         noise = problem.likelihood.noise(point.residual)
         near = problem.likelihood.noise(first.residual) < COMPARED_NOISE_RATIO * noise
@@ -144,10 +139,8 @@ def solve(
         elif judge is not None and near and KEPT_ERROR_SHARE * judge(first.edited) <= judge(point.edited):
             note = "kept the initialisation: path-traced, it is as close to the target as the solution"
         if note:
-            run, normal = before, problem.curvature(first, start)
-    return Solution(
-        problem.solution_params(run.state), run.history, whole, problem.posterior(run.state, normal), note
-    )
+            state, normal = start, problem.curvature(first, start)
+    return Solution(problem.solution_params(state), run, problem.posterior(state, normal), note)
 
 
 def descended(

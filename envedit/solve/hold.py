@@ -40,16 +40,14 @@ def said(weight: float, changed: float) -> str:
     )
 
 
-def further(
-    chosen: config.Target, weight: float, rendering: np.ndarray, aim: np.ndarray, *pixels: np.ndarray
-) -> float | None:
+def further(chosen: config.Target, weight: float, changed: float) -> float | None:
     """Return the weight with which an edit goes on; None where it need not, or where the weight was given.
 
-    ``chosen`` is table ``[target]``, ``weight`` that of what was not painted, in the steps that led to
-    ``rendering``; further arguments are those of :func:`change`.
+    ``chosen`` is table ``[target]``, ``weight`` that of what was not painted, and ``changed`` the
+    :func:`change` that it has led to.
     """
     if chosen.hold != "auto" or chosen.rest == "follow" or not chosen.paint:
         return None
-    if change(rendering, aim, *pixels) <= VISIBLE or weight >= LARGEST_HOLD:
+    if changed <= VISIBLE or weight >= LARGEST_HOLD:
         return None
     return min(LARGEST_HOLD, RAISE * weight)

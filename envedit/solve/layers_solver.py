@@ -160,7 +160,8 @@ class LayersSolver:
                 run = following
         self.posterior = solution.posterior
         self.note = "; ".join(self._notes(solution))
-        return solution.params, adam_loop.State(step=len(solution.history), history=solution.history)
+        history = solution.run.history
+        return solution.params, adam_loop.State(step=len(history), history=history)
 
     def _steps(self, problem, params, run, sparing, iterations=2 * gauss_newton.MOST_STEPS, after_step=None):
         """Make steps; what those towards a photograph find of its camera is taken off the target."""
@@ -182,7 +183,7 @@ class LayersSolver:
         notes = [solution.note] if solution.note else list(self._likelier)
         run = solution.run
         if run.hold > 1:
-            notes.append(hold.said(run.hold, hold.change(*self._without_paint(run))))
+            notes.append(hold.said(run.hold, self._changed_rest(run)))
         if "saturation" in solution.params and not solution.note:
             kept = 100 * float(np.exp(solution.params["saturation"].numpy()[0, 0]))
             notes.append(f"saturation of the sky's colours: {kept:.0f} % of the original's")
@@ -285,17 +286,17 @@ class LayersSolver:
         """Return a run that goes on with more weight on what was not painted; None where it need not."""
         if len(run.history) >= self.edit.settings.optimizer.iterations:
             return None
-        more = hold.further(self.edit.settings.target, run.hold, *self._without_paint(run))
+        more = hold.further(self.edit.settings.target, run.hold, self._changed_rest(run))
         if more is None:
             return None
         most = len(run.history) + gauss_newton.MOST_STEPS
         return self._hold(gauss_newton.Run(run.state, run.start, history=run.history, most=most, hold=more))
 
-    def _without_paint(self, run):
-        """Return what :func:`.hold.change` compares, at the point of a run, through T."""
+    def _changed_rest(self, run):
+        """Return how what was not painted has changed at the point of a run, through T."""
         target = self.edit.target
         rendering = self.edit.problem().evaluate(run.state, resolve=False).rendering
-        return rendering, target.aim, target.coverage, target.weight
+        return hold.change(rendering, target.aim, target.coverage, target.weight)
 
     # ---- What T has no part in -----------------------------------------------------------------------------
 

@@ -171,15 +171,15 @@ class _Model:
 
     def of_cells(self, flux):
         """Return strength and fall of F for a flux (3,) in each cell of the sky."""
-        parts, cells = self.normal.blocks, self.cells
-        columns = zip(parts.jacobian, parts.squared.T, flux, strict=True)
+        normal, cells = self.normal, self.cells
+        columns = zip(normal.linear.jacobian, normal.squared.T, flux, strict=True)
         mixed = [*cells.products([j * (f * w)[:, None] for j, w, f in columns])]
-        if parts.lights:
-            mixed.append(sum(cells.products([b * f for b, f in zip(parts.lights, flux, strict=True)])))
-        pull = sum(cells.products(list((parts.pulled * flux).T[..., None])))[0]
-        power = cells.power(parts.squared * flux**2).sum(axis=0)
-        by_blocks = self.normal.mean_of_rest.by_blocks.T
-        mean = cells.products([b[:, None] * f for b, f in zip(by_blocks, flux, strict=True)])
+        if normal.lights:
+            mixed.append(sum(cells.products([b * f for b, f in zip(normal.lights, flux, strict=True)])))
+        pull = sum(cells.products(list((normal.pulled * flux).T[..., None])))[0]
+        power = cells.power(normal.squared * flux**2).sum(axis=0)
+        of_mean = zip(normal.mean_by_blocks.T, flux, strict=True)
+        mean = cells.products([b[:, None] * f for b, f in of_mean])
         return self._best(np.concatenate(mixed), pull, power, np.concatenate(mean))
 
     def of_pixels(self, pictures):
@@ -204,23 +204,24 @@ class _Model:
     def _products(self, pictures):
         """Return products of pictures (n, pixels, 3) with the columns of J, the residual, and themselves."""
         normal, count = self.normal, len(pictures)
-        known = normal.pictures.reshape(len(normal.pictures), pictures.shape[1], 3)
+        linear = normal.linear
+        known = linear.pictures.reshape(len(linear.pictures), pictures.shape[1], 3)
         mixed: list[np.ndarray] = []
         by_pictures: Any = 0.0
         pull: Any = 0.0
         power: Any = 0.0
-        for c, j in enumerate(normal.blocks.jacobian):
+        for c, j in enumerate(linear.jacobian):
             mine = np.ascontiguousarray(pictures[..., c])
             slope, robust, residual, profile = (
                 np.broadcast_to(v, normal.slope.shape)[..., c].ravel()
-                for v in (normal.slope, normal.robust, normal.residual, normal.profile)
+                for v in (normal.slope, normal.robust, normal.residual, linear.profile)
             )
             weighted = mine * np.float32(slope**2 * robust)
             mixed.append(j.T @ self.problem.blocks.sums(weighted * profile).T)
             by_pictures = by_pictures + known[..., c] @ weighted.T if len(known) else np.zeros((0, count))
             pull = pull + mine @ (slope * robust * residual)
             power = power + np.einsum("np,np->n", mine, weighted)
-        by_pixels = normal.mean_of_rest.by_pixels.reshape(-1, 3)
+        by_pixels = normal.mean_by_pixels.reshape(-1, 3)
         mean = np.stack([pictures[..., c] @ by_pixels[:, c] for c in range(3)])
         return np.concatenate([*mixed, by_pictures]), pull, power, mean
 
@@ -229,9 +230,8 @@ class _Model:
 
         ``mean`` (3, n) is what the pictures do to the mean of the rest.
         """
-        rest = self.normal.mean_of_rest
-        mixed = mixed + rest.jacobian.T @ mean
-        pull = pull + rest.residual @ mean
+        mixed = mixed + self.normal.mean_by_unknowns.T @ mean
+        pull = pull + self.normal.mean @ mean
         half = forward(self._lower, mixed)
         along = half.T @ self._gradient - pull
         return half, along, power + np.square(mean).sum(axis=0)

@@ -35,7 +35,7 @@ from envedit.representations.layers.layers import Layers
 from envedit.solve.block_jacobian import BlockJacobian
 from envedit.solve.derivatives import Derivatives
 from envedit.solve.likelihood import Likelihood, on_average_one
-from envedit.solve.normal_equations import Blocks, MeanOfRest, Normal, solved
+from envedit.solve.normal_equations import Normal, solved
 from envedit.solve.prior import AXES, Prior
 from envedit.solve.unknowns import LOG_SATURATIONS, Point, Unknowns, in_numpy
 from envedit.targets.photo import Photo
@@ -279,14 +279,17 @@ class Problem(Unknowns):
             hessian=hessian,
             gradient=gradient if descent else np.zeros(unknowns),
             precision=precision,
-            unknowns=linear.named,
-            blocks=Blocks(linear.jacobian, squared, pulled, lights_in_blocks),
+            linear=linear,
             robust=robust,
             slope=slope,
             residual=point.residual,
-            profile=profile,
-            pictures=pictures,
-            mean_of_rest=MeanOfRest(mean_by_unknowns, mean, share * slope, mean_by_blocks),
+            squared=squared,
+            pulled=pulled,
+            lights=lights_in_blocks,
+            mean=mean,
+            mean_by_unknowns=mean_by_unknowns,
+            mean_by_pixels=share * slope,
+            mean_by_blocks=mean_by_blocks,
         )
 
     def curvature(self, point: Point, start: dict) -> Normal:
@@ -368,11 +371,11 @@ class Problem(Unknowns):
             return None
         if not np.isfinite(step).all():
             return None
-        return self.moved(state, step, normal.unknowns, LARGEST_STEP)
+        return self.moved(state, step, normal.linear.named, LARGEST_STEP)
 
     def _within(self, step, now, damped, normal):
         """Return a step, solved anew for all else where it takes the saturation out of its bounds."""
-        k = 3 * self.nodes + normal.unknowns.index(("saturation", 0, 0))
+        k = 3 * self.nodes + normal.linear.named.index(("saturation", 0, 0))
         if LOG_SATURATIONS[0] <= now + step[k] <= LOG_SATURATIONS[1]:
             return step
         to = np.clip(now + step[k], *LOG_SATURATIONS) - now
@@ -398,7 +401,7 @@ class Problem(Unknowns):
                 covariance = half.T @ half
                 # Not this problem, which keeps T in memory.
                 unknowns = Unknowns(self.layers, self.saturates, self.photographed)
-                sample = functools.partial(_sample, unknowns, state, lower, normal.unknowns)
+                sample = functools.partial(_sample, unknowns, state, lower, normal.linear.named)
         spread = [self.blocks.spread(one) for one in (covariance, prior)]
         whole = np.zeros((2, *self.envmap.shape[:2]), np.float32)
         whole[:, self.rows] = spread

@@ -6,52 +6,35 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from envedit.solve.derivatives import Linearisation
+
 ROWS = 64
 """Rows of a triangular matrix that are solved for together."""
 
 
 @dataclass(frozen=True)
-class Blocks:
-    """What normal equations are made of, by blocks of pixels."""
+class Normal:
+    """Hessian and gradient of F / 2 by m unknowns, and what they were made of."""
 
-    jacobian: list[np.ndarray]  # (blocks, n), of the gain, per channel
-    # squared, pulled: (blocks, 3), sums of weight times slope squared, and of weight, slope and residual
+    hessian: np.ndarray  # (m, m)
+    gradient: np.ndarray  # (m,)
+    precision: np.ndarray  # (m, m), K in the Hessian
+    linear: Linearisation  # derivatives of the rendering
+    # ---- Of pixels
+    robust: np.ndarray  # (h, w, 1), weights
+    slope: np.ndarray  # (h, w, 3), of the display curve
+    residual: np.ndarray  # (h, w, 3)
+    # ---- Sums over blocks of pixels
+    # squared, pulled: (blocks, 3), of weight times slope squared, and of weight, slope and residual
     squared: np.ndarray
     pulled: np.ndarray
-    # (blocks, k), sums of weight times slope squared times pictures of lights, per channel; may be empty
+    # (blocks, k), of weight times slope squared times pictures of lights, per channel; may be empty
     lights: list[np.ndarray]
-
-
-@dataclass(frozen=True)
-class MeanOfRest:
-    """The mean of what was not painted, q of ``likelihood.py``, as one more residual of each channel."""
-
-    jacobian: np.ndarray  # (3, m), its derivatives by the unknowns
-    residual: np.ndarray  # (3,), its value
-    by_pixels: np.ndarray  # (h, w, 3), its derivatives by the radiance of pixels
-    by_blocks: np.ndarray  # (blocks, 3), these times the profile, summed over blocks
-
-
-@dataclass(frozen=True)
-class Normal:
-    """Hessian (m, m) and gradient (m,) of F / 2.
-
-    ``precision`` is K in the Hessian, ``unknowns`` names those after the gain's, ``blocks`` is what the
-    Hessian was made of; so are weights ``robust`` (h, w, 1), ``slope`` of the display curve, ``residual`` and
-    ``profile`` of the blocks (h, w, 3), and ``pictures`` (k, h, w, 3) of the unknowns that are named.
-    """
-
-    hessian: np.ndarray
-    gradient: np.ndarray
-    precision: np.ndarray
-    unknowns: list
-    blocks: Blocks
-    robust: np.ndarray
-    slope: np.ndarray
-    residual: np.ndarray
-    profile: np.ndarray
-    pictures: np.ndarray
-    mean_of_rest: MeanOfRest
+    # ---- The mean of what was not painted, q of ``likelihood.py``, as one more residual of each channel
+    mean: np.ndarray  # (3,), its value
+    mean_by_unknowns: np.ndarray  # (3, m), its derivatives
+    mean_by_pixels: np.ndarray  # (h, w, 3), likewise by the radiance of pixels
+    mean_by_blocks: np.ndarray  # (blocks, 3), these times the profile, summed over blocks
 
     @property
     def determined(self) -> float:

@@ -158,7 +158,7 @@ def slopes(problem, state, unknowns, some, h, f):
 
 
 def names_of(problem, normal):
-    return ["gain"] * (3 * problem.nodes) + [name for name, _, _ in normal.unknowns]
+    return ["gain"] * (3 * problem.nodes) + [name for name, _, _ in normal.linear.named]
 
 
 @pytest.mark.parametrize("sigma", [0.02, 0.1, 1.0])  # most residuals in the linear part, some, none
@@ -205,14 +205,14 @@ def assert_gradient(problem, start, state, sigma, of_prior=True, normal=None):
     assert sorted(set(names)) == sorted(kinds)
     gradient = normal.gradient
     if not of_prior:
-        gradient = gradient - normal.precision @ problem._from_prior(state, start, normal.unknowns)
+        gradient = gradient - normal.precision @ problem._from_prior(state, start, normal.linear.named)
 
     def f(x):
         return total(problem, x, start if of_prior else None, sigma)
 
     for kind in kinds:
         some = [k for k, name in enumerate(names) if name == kind][:: 4 if kind == "gain" else 1]
-        slope = slopes(problem, state, normal.unknowns, some, STEPS[kind], f)
+        slope = slopes(problem, state, normal.linear.named, some, STEPS[kind], f)
         np.testing.assert_allclose(
             gradient[some], slope, rtol=0, atol=CLOSE[kind] * np.abs(slope).max(), err_msg=kind
         )
@@ -230,10 +230,10 @@ def test_hessian_is_that_of_the_jacobian_and_the_prior(case):
     slope = (plain_display(radiance * (1 + 1e-6)) - plain_display(radiance * (1 - 1e-6))) / (2e-6 * radiance)
     for k, name in enumerate(names):
         if name == "size":  # likewise forwards
-            ends, width = (moved(problem, state, normal.unknowns, k, 0.1), state), 0.1
+            ends, width = (moved(problem, state, normal.linear.named, k, 0.1), state), 0.1
         else:
             h = STEPS[name]
-            ends, width = [moved(problem, state, normal.unknowns, k, s * h) for s in (1, -1)], 2 * h
+            ends, width = [moved(problem, state, normal.linear.named, k, s * h) for s in (1, -1)], 2 * h
         ends = [np.float64(problem.evaluate(end).rendering) for end in ends]
         columns.append((slope * (ends[0] - ends[1]) / width).ravel())
     jacobian = np.stack(columns, axis=1)
@@ -266,18 +266,18 @@ def test_the_mean_of_the_rest_is_three_more_residuals_of_the_hessian(painted):
     names, columns = names_of(problem, with_mean), []
     for k, name in enumerate(names):
         steps = (0.1, 0.0) if name == "size" else (STEPS[name], -STEPS[name])
-        ends = [problem.evaluate(moved(problem, state, with_mean.unknowns, k, h)) for h in steps]
+        ends = [problem.evaluate(moved(problem, state, with_mean.linear.named, k, h)) for h in steps]
         means = [(share * end.residual).sum(axis=(0, 1)) for end in ends]
         columns.append((means[0] - means[1]) / (steps[0] - steps[1]))
     jacobian = np.stack(columns, axis=1)
     close = np.array([{"gain": 5e-3, "flux": 5e-3}.get(name, 0.2) for name in names])
-    found = with_mean.mean_of_rest.jacobian
+    found = with_mean.mean_by_unknowns
     for kind in sorted({*names}):
         some = [k for k, name in enumerate(names) if name == kind]
         largest = np.abs(jacobian[:, some]).max()
         assert (np.abs(found - jacobian)[:, some] < close[some] * largest).all(), kind
     np.testing.assert_allclose(part, found.T @ found, rtol=0, atol=1e-8 * values[-1])
-    np.testing.assert_allclose(with_mean.mean_of_rest.residual, mean)
+    np.testing.assert_allclose(with_mean.mean, mean)
 
 
 @pytest.mark.slow
@@ -297,19 +297,19 @@ def test_texture_within_a_block_is_in_the_derivatives(rng):
     assert problem.blocks.count == height * width // 4
     normal, h = problem.normal(point, start, sigma), STEPS["gain"]
     some = list(range(0, 3 * n, 7))
-    slope = slopes(problem, state, normal.unknowns, some, h, lambda x: total(problem, x, start))
+    slope = slopes(problem, state, normal.linear.named, some, h, lambda x: total(problem, x, start))
     np.testing.assert_allclose(normal.gradient[some], slope, rtol=0, atol=5e-3 * np.abs(slope).max())
     k = some[int(np.abs(slope).argmax())]
     ((ahead, back),) = differences(
-        problem, state, normal.unknowns, [k], h, lambda x: np.float64(problem.evaluate(x).rendering)
+        problem, state, normal.linear.named, [k], h, lambda x: np.float64(problem.evaluate(x).rendering)
     )
     column = normal.slope * (ahead - back) / (2 * h)
-    lights = normal.pictures * normal.slope
+    lights = normal.linear.pictures * normal.slope
     mixed = (lights * normal.robust * column).sum(axis=(1, 2, 3))
     np.testing.assert_allclose(normal.hessian[3 * n :, k], mixed, rtol=0, atol=5e-3 * np.abs(mixed).max())
     # Negative control: without the profile the sum is that of the blocks' means.
     even = problem.blocks.profile(np.ones((*film, 3)))
-    assert np.array_equal(even, np.ones_like(even)) and np.ptp(normal.profile) > 1
+    assert np.array_equal(even, np.ones_like(even)) and np.ptp(normal.linear.profile) > 1
 
 
 def plain_precision(problem, names, prior=PRIOR):
@@ -358,10 +358,10 @@ def test_penalty_is_that_of_the_precision(case, prior, rng):
     _, _, start, state = case
     problem = of_prior(case, prior)
     normal = problem.normal(problem.evaluate(state), start, 1.0)
-    x = problem._from_prior(state, start, normal.unknowns)
+    x = problem._from_prior(state, start, normal.linear.named)
     assert problem.penalty(state, start) == pytest.approx(x @ normal.precision @ x, rel=1e-9)
     pull, some = normal.precision @ x, rng.choice(3 * problem.nodes, 5, replace=False)
-    found = slopes(problem, state, normal.unknowns, some, 1e-4, lambda end: problem.penalty(end, start))
+    found = slopes(problem, state, normal.linear.named, some, 1e-4, lambda end: problem.penalty(end, start))
     np.testing.assert_allclose(pull[some], found, rtol=1e-4)
     spare = copy(start)
     spare["flux"][1], spare["turn"][1], spare["size"][1] = DARK + 0.3, 0.1, 0.2
@@ -422,7 +422,7 @@ def test_linear_problem_has_its_closed_solution(rng, monkeypatch):
     least = ((jacobian @ expected - by_channel) ** 2).sum() / sigma**2 + expected @ precision @ expected
     assert (got - expected) @ hessian @ (got - expected) < 1e-4 * least
     assert np.linalg.norm(got - expected) < 0.04 * np.linalg.norm(expected)
-    assert solution.history[-1]["loss"] == pytest.approx(least, rel=2e-3)
+    assert solution.run.history[-1]["loss"] == pytest.approx(least, rel=2e-3)
     # As noise would let steps do: what is asked for is noise.
     kept = solve(problem, params, iterations=60)
     assert kept.note and not problem.state(kept.params)["gain"].any()
@@ -473,7 +473,7 @@ def followed(problem, params, **options):
     start = problem.state(params)
     before, scale = problem.evaluate(start), np.inf
     sigma = problem.likelihood.least_noise
-    for row, point in zip(solution.history, points, strict=False):
+    for row, point in zip(solution.run.history, points, strict=False):
         f, earlier = (
             problem.likelihood.misfit(one.residual, row["sigma"]) + problem.penalty(one.state, start)
             for one in (point, before)
@@ -482,8 +482,8 @@ def followed(problem, params, **options):
         assert f < earlier
         assert sigma <= row["sigma"] <= max(scale, sigma)
         before, scale = point, row["sigma"]
-    assert [row["iteration"] for row in solution.history] == list(range(len(solution.history)))
-    assert all(np.isfinite(list(row.values())).all() for row in solution.history)
+    assert [row["iteration"] for row in solution.run.history] == list(range(len(solution.run.history)))
+    assert all(np.isfinite(list(row.values())).all() for row in solution.run.history)
     assert all(np.isfinite(value.numpy()).all() for value in solution.params.values())
     assert np.isfinite(solution.posterior.deviation).all()
     last = problem.evaluate(problem.state(solution.params))
@@ -495,7 +495,7 @@ def test_scale_is_that_of_the_residual_and_falls_by_half_at_most(case):
     problem, params, start, _ = case
     problem = known_to(problem, 0.05)
     solution, last = followed(problem, params, iterations=30)
-    scales = [row["sigma"] for row in solution.history]
+    scales = [row["sigma"] for row in solution.run.history]
     residual = problem.evaluate(start).residual
     assert scales[0] == problem.likelihood.noise(residual)
     assert all(b >= a / 2 * (1 - 1e-12) for a, b in zip(scales, scales[1:], strict=False))
@@ -514,7 +514,7 @@ def test_a_step_that_raises_f_is_damped(case, monkeypatch):
 
     monkeypatch.setattr(Problem, "step", far)
     solution, _ = followed(known_to(problem, 0.1), params)
-    assert len(dampings) > len(solution.history) > 1 and max(dampings) >= 0.5
+    assert len(dampings) > len(solution.run.history) > 1 and max(dampings) >= 0.5
     rises = [b / a for a, b in zip(dampings, dampings[1:], strict=False) if b > a]
     assert rises and min(rises) >= 10 * (1 - 1e-9)
 
@@ -545,7 +545,7 @@ def test_no_step_takes_a_light_below_the_horizon(rng):
     for _ in range(10):
         normal = problem.normal(problem.evaluate(state), start, 0.01)
         down = np.zeros_like(normal.gradient)
-        for k, (name, _, axis) in enumerate(normal.unknowns, 3 * problem.nodes):
+        for k, (name, _, axis) in enumerate(normal.linear.named, 3 * problem.nodes):
             if name == "turn":
                 lower = problem.direction(state, 0) + 0.01 * np.cross(axis, problem.direction(state, 0))
                 down[k] = 1e9 * np.sign(lower[1] - problem.direction(state, 0)[1])
@@ -588,8 +588,8 @@ def test_damping_lets_the_whole_sky_change_in_one_step(rng):
 def test_fewest_steps(case):
     problem, params, start, _ = case
     none = solve(problem, params, iterations=0)
-    assert none.history == [] and same(problem.state(none.params), start)
-    assert len(solve(problem, params, iterations=1).history) == 1
+    assert none.run.history == [] and same(problem.state(none.params), start)
+    assert len(solve(problem, params, iterations=1).run.history) == 1
 
 
 # ---- extremes ----------------------------------------------------------------------------------------------
@@ -631,7 +631,7 @@ def test_targets_of_any_radiance(rng, value):
     image = clouds(rng) + lamp()
     problem, solution, last = extreme(rng, image, lambda t: np.full((*FILM, 3), value, np.float32))
     before = shown(problem.transport, image).mean()
-    assert solution.history and (last.rendering.mean() > before) == (value > before)
+    assert solution.run.history and (last.rendering.mean() > before) == (value > before)
 
 
 @pytest.mark.slow
@@ -698,7 +698,7 @@ def test_steps_to_what_is_not_finite_are_not_taken(case, monkeypatch):
 
     monkeypatch.setattr(Problem, "step", spoiled)
     solution, last = followed(known_to(problem, 0.05), params)
-    assert len(solution.history) > 1 and len(calls) > len(solution.history)
+    assert len(solution.run.history) > 1 and len(calls) > len(solution.run.history)
     assert last.residual is not None
 
 
@@ -783,9 +783,9 @@ def test_how_far_a_light_lowers_f_is_what_the_normal_equations_say(of, request):
 
     def mixed_with(one):
         in_blocks = problem.blocks.summed((one * weights).reshape(*FILM, 3))
-        of_sky = [j.T @ w for j, w in zip(normal.blocks.jacobian, in_blocks.T, strict=True)]
-        of_lights = normal.pictures.reshape(len(normal.pictures), -1) @ (one * weights).ravel()
-        return np.concatenate([*of_sky, of_lights]) + mean_of(one) @ normal.mean_of_rest.jacobian
+        of_sky = [j.T @ w for j, w in zip(normal.linear.jacobian, in_blocks.T, strict=True)]
+        of_lights = normal.linear.pictures.reshape(len(normal.linear.pictures), -1) @ (one * weights).ravel()
+        return np.concatenate([*of_sky, of_lights]) + mean_of(one) @ normal.mean_by_unknowns
 
     mean, mixed = mean_of(atom), mixed_with(atom)
     assert mean.any() == (of == "painted")
@@ -839,7 +839,8 @@ def test_the_glow_is_in_the_derivative_by_a_lights_flux_and_place(added, rng):
         if name == "size":
             continue
         h = STEPS[name]
-        ends = [problem.evaluate(moved(problem, state, normal.unknowns, 3 * n + k, s * h)) for s in (1, -1)]
+        there = (moved(problem, state, normal.linear.named, 3 * n + k, sign * h) for sign in (1, -1))
+        ends = [problem.evaluate(one) for one in there]
         slope = (ends[0].rendering - ends[1].rendering) / (2 * h)
         # Cells are some texels, and the glow's own peak is narrower.
         assert np.abs(pictures[k] - slope).max() < 0.15 * np.abs(slope).max(), name
@@ -871,7 +872,8 @@ def test_gradient_where_rows_below_the_horizon_follow(horizon, rng):
         some = [k for k, name in enumerate(names) if name == kind]
         if kind == "gain":  # and the last node, which is the ground's
             some = some[::4] + [n - 1, 2 * n - 1, 3 * n - 1]
-        slope = slopes(problem, state, normal.unknowns, some, STEPS[kind], lambda x: total(problem, x, start))
+        named, h = normal.linear.named, STEPS[kind]
+        slope = slopes(problem, state, named, some, h, lambda x: total(problem, x, start))
         close = {"gain": 2e-3, "flux": 0.05, "turn": 0.05, "saturation": 2e-3}[kind] * np.abs(slope).max()
         np.testing.assert_allclose(normal.gradient[some], slope, rtol=0, atol=close, err_msg=kind)
 
@@ -925,11 +927,11 @@ def test_gradient_by_the_sky_is_exact_where_a_block_is_not(rng):
 
     some = range(0, 3 * problem.nodes, 5)
     slope = slopes(problem, state, [], some, STEPS["gain"], lambda x: total(problem, x, sigma=sigma))
-    prior = normal.precision @ problem._from_prior(state, start, normal.unknowns)
+    prior = normal.precision @ problem._from_prior(state, start, normal.linear.named)
     got = (normal.gradient - prior)[some]
     np.testing.assert_allclose(got, slope, rtol=0, atol=5e-3 * np.abs(slope).max())
     # Negative control: the block transport's own gradient is another one.
-    columns = [j.T @ normal.blocks.pulled[:, c] for c, j in enumerate(normal.blocks.jacobian)]
+    columns = [j.T @ normal.pulled[:, c] for c, j in enumerate(normal.linear.jacobian)]
     assert np.abs(np.concatenate(columns)[some] - slope).max() > 0.05 * np.abs(slope).max()
 
 
@@ -962,7 +964,7 @@ def test_saturation_of_the_target_is_found(rng):
     problem.saturates = False
     other = solve(known_to(problem, 0.002), params)
     assert "saturation" not in other.params
-    assert other.history[-1]["loss"] > 2 * found.history[-1]["loss"]
+    assert other.run.history[-1]["loss"] > 2 * found.run.history[-1]["loss"]
 
 
 def test_a_sky_gets_no_more_saturated_and_the_rest_of_a_step_makes_up_for_it(rng):
@@ -971,7 +973,7 @@ def test_a_sky_gets_no_more_saturated_and_the_rest_of_a_step_makes_up_for_it(rng
     point = problem.evaluate(state)
     normal = problem.normal(point, state, 0.1)
     k = len(normal.gradient) - 1
-    assert normal.unknowns[-1] == ("saturation", 0, 0)
+    assert normal.linear.named[-1] == ("saturation", 0, 0)
     assert np.linalg.solve(normal.hessian, -normal.gradient)[k] > 0.05  # it would
     moved_by = problem.step(state, normal, 0.0)
     assert moved_by["saturation"][0, 0] == 0

@@ -9,10 +9,7 @@ from envedit.solve import hold
 
 def further(weight, changed, **target):
     """Ask for the next weight where what was not painted has changed by so much of a display value."""
-    coverage = np.array([0.0, 1.0]).reshape(1, 2, 1)
-    rendering = np.full((1, 2, 3), changed**2.2)
-    chosen = config.Target(**({"rest": "keep"} | target))
-    return hold.further(chosen, weight, rendering, np.zeros((1, 2, 3)), coverage, np.ones((1, 2, 1)))
+    return hold.further(config.Target(**({"rest": "keep"} | target)), weight, changed)
 
 
 def test_only_pixels_without_paint_that_count_have_changed():

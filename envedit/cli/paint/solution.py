@@ -213,8 +213,8 @@ class Solution:
 
     def hold_more(self) -> bool:
         """Give more weight to what was not painted, if it has changed visibly, as an edit does."""
-        asked, rendering = self.asked_settings.target, self.point.rendering
-        more = hold.further(asked, self.hold, rendering, self.target, self.coverage, self.weight)
+        changed = hold.change(self.point.rendering, self.target, self.coverage, self.weight)
+        more = hold.further(self.asked_settings.target, self.hold, changed)
         if more is None:
             return False
         self.hold = more

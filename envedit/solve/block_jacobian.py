@@ -20,17 +20,17 @@ class BlockJacobian:
 
     def __init__(self, layers: Layers, transport: LightTransport, shape: tuple[int, int]):
         overview = transport.overview()
-        self.block_of, self.count = overview.block_of, len(overview.matrix[0])
+        self.block_of, self.count = overview.block_of, overview.blocks
         active = slice(layers.active.start * shape[1], layers.active.stop * shape[1])
         self._shape, self._own = layers.whole, layers.shape[0] * layers.shape[1]
-        cells, omega = len(overview.omega), np.repeat(latlong.lookup_solid_angles(*shape), shape[1])
+        cells, omega = overview.cells, np.repeat(latlong.lookup_solid_angles(*shape), shape[1])
         self._directions = overview.directions
         # Pixels in the order of their blocks, where each block begins, and which these are.
         self._order = np.argsort(self.block_of, kind="stable")
         ordered = self.block_of[self._order]
         self._starts = np.flatnonzero(np.diff(ordered, prepend=-1))
         self._present = ordered[self._starts]
-        self._total = np.bincount(overview.cell_of, omega, cells)
+        self._total = overview.omega
         self._cell, self._omega, self._cells = overview.cell_of[active], omega[active], cells
         self._changeable = (self._omega.reshape(*self._shape, 1) * layers.changeable).ravel()
         # Hats are weighed by the sky's luminance: what is bright in a cell determines its gain.

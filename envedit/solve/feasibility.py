@@ -34,7 +34,7 @@ from envedit.core.seeds import SIGNS
 from envedit.images import map_regions
 from envedit.solve.gain_bandwidth import PROBES
 from envedit.solve.likelihood import STATEMENTS, Likelihood, on_average_one
-from envedit.transport.block_transport import CELLS, tiles
+from envedit.transport.block_transport import sky_cells
 from envedit.transport.light_transport import LightTransport
 
 SHARP_SAMPLES = 4.0
@@ -137,13 +137,20 @@ def reachable(
     active[slice(None) if rows is None else rows.slice] = True
     if kept is not None:
         active &= kept < map_regions.KEPT_SHARE
-    request = _Request.of(transport, original, target, likelihood, painted, rendered)
-    distance = request.distance(request.initial)
+    likelihood = likelihood or Likelihood(on_average_one(None, transport.shape))
+    painted = likelihood.weight[..., 0] > 0 if painted is None else painted
+    transport.resolve(original)
+    initial = _rendering(transport, original)
+    aim = target.astype(np.float64)
+    if rendered is not None:
+        aim = aim + initial - rendered
+    request = _Request(initial, np.maximum(aim, 0), likelihood, painted.astype(np.float64))
+    distance = request.distance(initial)
     if distance < 1e-6:  # float32
         distance = 0.0
 
     # ---- The closest of the original's picture, the solution's, and that of the map that is known
-    candidates = [(original, request.initial)]
+    candidates = [(original, initial)]
     if distance > 0 and (transport.influence[active] > 0).any():
         candidates.append(_solution(transport, original, active, request))
     if distance > 0 and known is not None:
@@ -172,17 +179,6 @@ class _Request:
     target: np.ndarray
     likelihood: Likelihood
     painted: np.ndarray
-
-    @classmethod
-    def of(cls, transport, original, target, likelihood, painted, rendered):
-        target = target.astype(np.float64)
-        likelihood = likelihood or Likelihood(on_average_one(None, transport.shape))
-        painted = likelihood.weight[..., 0] > 0 if painted is None else painted
-        transport.resolve(original)
-        initial = _rendering(transport, original)
-        if rendered is not None:
-            target = target + initial - rendered
-        return cls(initial, np.maximum(target, 0), likelihood, painted.astype(np.float64))
 
     def distance(self, picture):
         """Mean absolute difference of display values in the painted region."""
@@ -224,8 +220,7 @@ def _cells(transport, shape):
     An entry w stands for about w times as many samples as a pixel has. Its mean over a cell's light is
     sum w^2 / sum w, and sum w^2 is the mean of (T's)^2 over pictures s of random signs (Hutchinson 1990).
     """
-    height, width = shape
-    flat, _ = tiles(height, width, max(1, -(-width // CELLS)))
+    flat, _ = sky_cells(shape[0], shape[1])
     square, rng = np.zeros(shape), np.random.default_rng(SIGNS)
     for _ in range(PROBES):
         signs = rng.choice(np.array([-1, 1], np.float32), size=(*transport.shape, 3))

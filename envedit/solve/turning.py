@@ -156,8 +156,6 @@ def _at_a_glance(transport, envmap, picture, weight, rendering):
     share = overview.to_blocks(count)
     lamps = overview.to_blocks(transport.other_light())
     omega = np.repeat(latlong.lookup_solid_angles(height, width), width).reshape(height, width)
-    total = np.bincount(overview.cell_of, omega.ravel())
-    cells = len(total)
     # By rows of texels first: a turn keeps them.
     column = overview.cell_of.reshape(height, width)
     first = column[:, 0]
@@ -169,7 +167,7 @@ def _at_a_glance(transport, envmap, picture, weight, rendering):
     starts = np.arange(0, width, tile)
     for c in range(3):
         turned = np.stack([np.add.reduceat(np.roll(band[..., c], -k, 1), starts, 1) for k in range(width)], 2)
-        means = turned.reshape(cells, width) / total[:, None]
+        means = turned.reshape(overview.cells, width) / overview.omega[:, None]
         blocks = overview.matrix[c] @ means.astype(np.float32) + lamps[:, c : c + 1]
         shown = display_curve.values(blocks)
         result += (share * np.square(shown - target[:, c : c + 1])).sum(axis=0)

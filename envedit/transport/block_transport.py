@@ -8,8 +8,6 @@ anywhere on the sphere, roughly what it does to the picture.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from envedit.core import latlong
@@ -23,58 +21,51 @@ BLOCKS = 32
 """Blocks along the longer side of a view."""
 
 
-@dataclass(frozen=True)
 class Overview:
-    """T between blocks and cells; made by :meth:`of`."""
+    """T between blocks of a picture and cells of a map.
 
-    # (3, blocks, cells) float32, mean over the pixels of a block, for a radiance of 1 in all texels of a cell
+    ``shape`` and ``grid`` are height and width of the picture and of the map, ``views`` the rows of each
+    view, where the picture is of several: no block is of two.
+
+    Attributes
+    ----------
+    block_of, cell_of : ndarray (h * w,), (H * W,)
+        Block of every pixel, and cell of every texel.
+    blocks, cells : int
+        How many there are.
+    directions, omega : ndarray (cells, 3), (cells,)
+        Unit vectors to the cells' centres, and the solid angle of each cell, as a rendering receives it.
+    matrix : ndarray (3, blocks, cells)
+        Mean over the pixels of a block, for a radiance of 1 in all texels of a cell: what :meth:`summed`
+        returns.
+    """
+
     matrix: np.ndarray
-    block_of: np.ndarray  # (h * w,), block of every pixel
-    cell_of: np.ndarray  # (H * W,), cell of every texel
-    directions: np.ndarray  # (cells, 3), unit vectors to the cells' centres
-    omega: np.ndarray  # (cells,), solid angle of each cell, as a rendering receives it
 
-    @classmethod
-    def of(
-        cls, matrix: np.ndarray, shape: tuple[int, int], grid: tuple[int, int], views: Views = ()
-    ) -> Overview:
-        """Say of which pixels and texels a matrix of :func:`summed`, with the same arguments, is."""
-        block_of, _ = _blocks(shape, views)
-        cell_of, cells = _cells(grid)
-        omega = np.repeat(latlong.lookup_solid_angles(*grid), grid[1])
-        toward = _means(latlong.directions(*grid).reshape(-1, 3), cell_of, omega)
-        toward /= np.maximum(np.linalg.norm(toward, axis=1, keepdims=True), 1e-30)
-        return cls(matrix, block_of, cell_of, toward, np.bincount(cell_of, omega, cells))
+    def __init__(self, shape: tuple[int, int], grid: tuple[int, int], views: Views = ()):
+        self.block_of, self.blocks = _blocks(shape, views)
+        height, width = grid
+        self.cell_of, self.cells = sky_cells(height, width)
+        omega = np.repeat(latlong.lookup_solid_angles(height, width), width)
+        toward = _means(latlong.directions(height, width).reshape(-1, 3), self.cell_of, omega)
+        self.directions = toward / np.maximum(np.linalg.norm(toward, axis=1, keepdims=True), 1e-30)
+        self.omega = np.bincount(self.cell_of, omega, self.cells)
+
+    def summed(self, transport: ColourMatrix) -> np.ndarray:
+        """Sum up the entries of a transport, pixels by texels, to a :attr:`matrix`, float32."""
+        rows, columns, weights = transport.coordinates()
+        key = self.block_of[rows] * self.cells + self.cell_of[columns]
+        count = np.bincount(self.block_of, minlength=self.blocks)[:, None]
+        sums = [np.bincount(key, w, self.blocks * self.cells) for w in weights.T]
+        return np.stack([one.reshape(self.blocks, self.cells) / count for one in sums]).astype(np.float32)
+
+    def fits(self, arrays: dict[str, np.ndarray]) -> bool:
+        """Return whether arrays from disk are a :attr:`matrix` of these blocks and cells."""
+        return holds(arrays, {"matrix": ("f4", (3, self.blocks, self.cells))})
 
     def to_blocks(self, picture: np.ndarray) -> np.ndarray:
         """Average a picture (h, w, c) over blocks: (blocks, c)."""
         return _means(picture.reshape(-1, picture.shape[2]), self.block_of, np.ones(len(self.block_of)))
-
-
-def summed(
-    matrix: ColourMatrix, shape: tuple[int, int], grid: tuple[int, int], views: Views = ()
-) -> np.ndarray:
-    """Sum up the entries of a transport, pixels by texels, to :attr:`Overview.matrix`.
-
-    ``shape`` and ``grid`` are height and width of the picture and of the map, ``views`` the rows of each
-    view, where the picture is of several: no block is of two.
-    """
-    block_of, blocks = _blocks(shape, views)
-    cell_of, cells = _cells(grid)
-    rows, columns, weights = matrix.coordinates()
-    key = block_of[rows] * cells + cell_of[columns]
-    count = np.bincount(block_of, minlength=blocks)
-    dense = np.stack(
-        [np.bincount(key, w, blocks * cells).reshape(blocks, cells) / count[:, None] for w in weights.T]
-    )
-    return dense.astype(np.float32)
-
-
-def whole(
-    arrays: dict[str, np.ndarray], shape: tuple[int, int], grid: tuple[int, int], views: Views = ()
-) -> bool:
-    """Return whether arrays from disk are the matrix of such a picture and map."""
-    return holds(arrays, {"matrix": ("f4", (3, _blocks(shape, views)[1], _cells(grid)[1]))})
 
 
 def _blocks(shape, views):
@@ -90,9 +81,8 @@ def _blocks(shape, views):
     return np.concatenate(parts), count
 
 
-def _cells(grid):
-    """Return the cell of every texel, and their number."""
-    height, width = grid
+def sky_cells(height: int, width: int) -> tuple[np.ndarray, int]:
+    """Return the cell of every texel of a map, flat, and the count of cells."""
     return tiles(height, width, max(1, -(-width // CELLS)))
 
 

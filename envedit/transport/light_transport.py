@@ -37,8 +37,8 @@ from envedit.core.radiance import require_radiance, require_unmasked
 from envedit.core.types import ArrayLike, Progress
 from envedit.scene import built_scene
 from envedit.scene.scene import Scene
-from envedit.transport import block_transport as overviews
 from envedit.transport import bright_texels, sampling_plan
+from envedit.transport.block_transport import Overview
 from envedit.transport.exact_columns import ExactColumns
 from envedit.transport.influence import determined
 from envedit.transport.recording import other_light, record_all
@@ -108,7 +108,7 @@ class LightTransport:
         # Texels that were bright in the map that was resolved last; with those of maps before, last first
         self._bright: np.ndarray = np.zeros(0, np.int64)
         self._recent: np.ndarray = np.zeros(0, np.int64)
-        self._overview: overviews.Overview | None = None
+        self._overview: Overview | None = None
         self._stored: tuple[DiskCache, dict[str, Any]] = DiskCache(None), {}
         self._exact = ExactColumns(scene, grid, plan.bounces, plan.capacity, plan.paths_bytes)
 
@@ -303,18 +303,17 @@ class LightTransport:
         """Let go of T's memory; nothing can be asked of it afterwards."""
         del self.forward, self.reverse, self._exact
 
-    def overview(self) -> overviews.Overview:
+    def overview(self) -> Overview:
         """Return T between blocks of pixels and cells of texels; summed up once and kept on disk."""
         if self._overview is None:
             cache, key = self._stored
-            grid = self.grid.shape
-            views = self.scene.rows
-            stored = cache.load(key, lambda arrays: overviews.whole(arrays, self.shape, grid, views))
+            overview = Overview(self.shape, self.grid.shape, self.scene.rows)
+            stored = cache.load(key, overview.fits)
             if stored is None:
-                stored = {"matrix": overviews.summed(self.forward, self.shape, grid, views)}
+                stored = {"matrix": overview.summed(self.forward)}
                 cache.store(key, stored)
-            matrix = np.array(stored["matrix"])  # a copy: it may be a mapped file
-            self._overview = overviews.Overview.of(matrix, self.shape, grid, views)
+            overview.matrix = np.array(stored["matrix"])  # a copy: it may be a mapped file
+            self._overview = overview
         return self._overview
 
     # ---- using ---------------------------------------------------------------------------------------------

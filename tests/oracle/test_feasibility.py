@@ -94,7 +94,7 @@ def test_the_solution_is_that_of_coordinate_descent(dense, envmap, rng, monkeypa
     monkeypatch.setattr(feasibility, "SHARP_SAMPLES", 0)  # every texel by itself
     monkeypatch.setattr(feasibility, "STEPS", 2000)
     found = feasibility.reachable(dense, envmap, target, weighed(weight))
-    request = feasibility._Request.of(dense, envmap, target, weighed(weight), None, None)
+    request = feasibility._Request(render(dense, envmap), target, weighed(weight), np.ones(PIXELS))
     w = request.weights(found.picture)  # as linearised where the solution is
 
     def value(picture):

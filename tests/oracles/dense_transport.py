@@ -4,7 +4,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from envedit.transport import block_transport
+from envedit.transport.block_transport import Overview
 from envedit.transport.sparse_matrix import ColourMatrix
 
 
@@ -73,5 +73,6 @@ class DenseTransport:
         some, texel = np.nonzero(self.weights.any(axis=0))
         entries = some.astype(np.uint32), texel.astype(np.uint32), self.weights[:, some, texel].T
         matrix = ColourMatrix(*entries, self.weights.shape[1:])
-        summed = block_transport.summed(matrix, self.shape, self.grid)
-        return block_transport.Overview.of(summed, self.shape, self.grid)
+        overview = Overview(self.shape, self.grid)
+        overview.matrix = overview.summed(matrix)
+        return overview

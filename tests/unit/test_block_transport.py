@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from envedit.core import latlong
-from envedit.transport import block_transport
+from envedit.transport.block_transport import Overview
 from envedit.transport.sparse_matrix import ColourMatrix
 
 # (picture, map): tiles of one and of several pixels or texels, that divide the sides and that do not.
@@ -33,8 +33,9 @@ def transport(rng, shape, grid):
 
 
 def overview(matrix, shape, grid, views=()):
-    summed = block_transport.summed(matrix, shape, grid, views)
-    return block_transport.Overview.of(summed, shape, grid, views)
+    overview = Overview(shape, grid, views)
+    overview.matrix = overview.summed(matrix)
+    return overview
 
 
 @pytest.mark.parametrize("shape, grid", SIZES)
@@ -73,8 +74,8 @@ def test_no_block_is_of_two_views(rng):
     views, grid = (slice(0, 33), slice(33, 66)), (4, 65)
     matrix, full = transport(rng, (66, 20), grid)
     result = overview(matrix, (66, 20), grid, views)
-    assert block_transport.whole({"matrix": result.matrix}, (66, 20), grid, views)
-    assert not block_transport.whole({"matrix": result.matrix}, (66, 20), grid)
+    assert result.fits({"matrix": result.matrix})
+    assert not Overview((66, 20), grid).fits({"matrix": result.matrix})
     half = np.split(result.matrix, 2, axis=1)
     for rows, one in zip(views, half, strict=True):
         part = full[rows].reshape(33 * 20, -1, 3)

@@ -77,8 +77,11 @@ class Objective:
         self._target = dr.opaque(to_display(tensor(picture)))
         self._weight = None if pixel_weight is None else tensor(pixel_weight)
         self._original = tensor(original)
-        shown = self._target, self._weight
-        self._ssim = StackedSsim(*shown, views) if len(views) > 1 else Ssim(*shown)
+        self._ssim: Ssim | StackedSsim
+        if len(views) > 1:
+            self._ssim = StackedSsim(self._target, self._weight, views)
+        else:
+            self._ssim = Ssim(self._target, self._weight)
         self._dists = dists.against(to_display(self._original)) if "dists" in self.ramps else None
         self._every, self._last = every, None
 
@@ -207,13 +210,9 @@ class _Keep:
 
 
 def adam_for(representation: Representation, params: Params, settings: config.Optimizer) -> optimizer.Adam:
-    """Make the optimiser that a configuration asks for."""
-    return optimizer.Adam(params, _rate(representation, settings), (0.9, settings.beta2))
-
-
-def _rate(representation, settings):
-    """Learning rate at the start; "auto" is the representation's own."""
-    return representation.lr if settings.lr == "auto" else settings.lr
+    """Make the optimiser that a configuration asks for; a rate of "auto" is the representation's own."""
+    rate = representation.lr if isinstance(settings.lr, str) else settings.lr
+    return optimizer.Adam(params, rate, (0.9, settings.beta2))
 
 
 def optimise(
@@ -269,7 +268,6 @@ def optimise(
         and gradients were finite.
     """
     adam, state = adam or adam_for(representation, params, settings), state or State()
-    lr = _rate(representation, settings)
     fixed = tensor(envmap)
     keep = _Keep(envmap[first_row : first_row + len(free)], free) if free is not None else None
     while state.step < settings.iterations:
@@ -285,7 +283,9 @@ def optimise(
         dr.eval(total, terms, slopes.flags)
         grads = {name: dr.grad(leaf) for name, leaf in leaves.items()}
         finite = bool(dr.isfinite(total)[0]) and slopes.finite()
-        rate = optimizer.cosine(lr, state.step, settings.iterations) if settings.schedule == "cosine" else lr
+        rate = adam.lr
+        if settings.schedule == "cosine":
+            rate = optimizer.cosine(rate, state.step, settings.iterations)
         rate *= state.slowdown
         if finite and adam.step(grads, lr=rate):
             state.bad_in_a_row = 0

@@ -236,7 +236,7 @@ def test_a_run_that_is_cut_and_continued_gives_the_same_bits(cut, rng):
     with pytest.raises(KeyboardInterrupt):
         adam_loop.optimise(*fresh(), after_step=kill)
     arguments = fresh()
-    adam = optimizer.Adam(arguments[1], 123.0, (0.9, arguments[6].beta2))
+    adam = optimizer.Adam(arguments[1], arguments[6].lr, (0.9, arguments[6].beta2))
     adam.load_state_dict(kept["adam"])
     state = adam_loop.State(**json.loads(kept["state"]))
     params, state = adam_loop.optimise(*arguments, adam=adam, state=state)

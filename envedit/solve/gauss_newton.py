@@ -66,8 +66,18 @@ class Run:
             for part in ("state", "start")
         )
         damping, scale, finished, most, hold, wide, corrected = arrays["numbers"].tolist()
-        done = bool(finished), list(history), int(most), hold, bool(wide), bool(corrected)
-        return cls(state, start, damping, scale or np.inf, *done)
+        return cls(
+            state=state,
+            start=start,
+            damping=damping,
+            scale=scale or np.inf,
+            finished=bool(finished),
+            history=list(history),
+            most=int(most),
+            hold=hold,
+            wide=bool(wide),
+            corrected=bool(corrected),
+        )
 
 
 @dataclass

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -161,6 +161,15 @@ class Places:
         return float(self._model.of_pixels(picture)[1][0])
 
 
+class _Products(NamedTuple):
+    """Products of n pictures of lights, of strength 1, weighted: what F falls by is made of."""
+
+    mixed: np.ndarray  # (m, n), with the derivatives by the unknowns
+    pull: np.ndarray  # (n,), with the residual
+    power: np.ndarray  # (n,), with themselves
+    mean: np.ndarray  # (3, n), what they do to the mean of what was not painted
+
+
 class _Model:
     """F around a point, as its normal equations have it."""
 
@@ -180,18 +189,19 @@ class _Model:
         power = cells.power(normal.squared * flux**2).sum(axis=0)
         of_mean = zip(normal.mean_by_blocks.T, flux, strict=True)
         mean = cells.products([b[:, None] * f for b, f in of_mean])
-        return self._best(np.concatenate(mixed), pull, power, np.concatenate(mean))
+        return self._best(_Products(np.concatenate(mixed), pull, power, np.concatenate(mean)))
 
     def of_pixels(self, pictures):
         """Return the same for pictures (n, pixels, 3)."""
-        return self._best(*self._products(pictures))
+        return self._best(self._products(pictures))
 
     def of_channels(self, picture, strengths):
         """Return the best strengths (3,) of a picture (pixels, 3) that has one in each channel.
 
         At least :data:`FAINTEST` of the strongest; those given, where they have no solution.
         """
-        half, along, power = self._reduced(*self._products(np.float32(picture * np.eye(3)[:, None])))
+        products = self._products(np.float32(picture * np.eye(3)[:, None]))
+        half, along, power = self._reduced(products)
         rest = np.diag((1 + LEAST_UNEXPLAINED) * power) - half.T @ half
         try:
             flux = np.linalg.solve(rest, along)
@@ -202,7 +212,7 @@ class _Model:
         return np.maximum(flux, FAINTEST * flux.max())
 
     def _products(self, pictures):
-        """Return products of pictures (n, pixels, 3) with the columns of J, the residual, and themselves."""
+        """Return the products of pictures (n, pixels, 3)."""
         normal, count = self.normal, len(pictures)
         linear = normal.linear
         known = linear.pictures.reshape(len(linear.pictures), pictures.shape[1], 3)
@@ -223,22 +233,20 @@ class _Model:
             power = power + np.einsum("np,np->n", mine, weighted)
         by_pixels = normal.mean_by_pixels.reshape(-1, 3)
         mean = np.stack([pictures[..., c] @ by_pixels[:, c] for c in range(3)])
-        return np.concatenate([*mixed, by_pictures]), pull, power, mean
+        return _Products(np.concatenate([*mixed, by_pictures]), pull, power, mean)
 
-    def _reduced(self, mixed, pull, power, mean):
-        """Return L^-1 times the mixed part, the slope beside the other unknowns, and the power.
-
-        ``mean`` (3, n) is what the pictures do to the mean of the rest.
-        """
-        mixed = mixed + self.normal.mean_by_unknowns.T @ mean
-        pull = pull + self.normal.mean @ mean
+    def _reduced(self, products):
+        """Return L^-1 times the mixed part, the slope beside the other unknowns, and the power."""
+        mean = products.mean
+        mixed = products.mixed + self.normal.mean_by_unknowns.T @ mean
+        pull = products.pull + self.normal.mean @ mean
         half = forward(self._lower, mixed)
         along = half.T @ self._gradient - pull
-        return half, along, power + np.square(mean).sum(axis=0)
+        return half, along, products.power + np.square(mean).sum(axis=0)
 
-    def _best(self, *products):
+    def _best(self, products):
         """Return strengths and falls of single pictures."""
-        half, along, power = self._reduced(*products)
+        half, along, power = self._reduced(products)
         rest = power - np.square(half).sum(axis=0)
         strength = np.divide(along, rest, out=np.zeros_like(rest), where=rest > LEAST_UNEXPLAINED * power)
         fall = np.maximum(strength, 0) * along

@@ -39,7 +39,7 @@ a bare mention" (Kass and Raftery 1995)."""
 
 
 @dataclass(frozen=True)
-class Place:
+class PaintedPlace:
     """A direction (3,), the log flux (3,) of a light there, over its own, and -2 log likelihood with it."""
 
     direction: np.ndarray
@@ -48,7 +48,7 @@ class Place:
     degrees: float = LOBE_DEGREES  # radius of a light that is added
 
 
-def best(problem: Problem, state: dict, k: int, away: np.ndarray | None = None) -> list[Place]:
+def best(problem: Problem, state: dict, k: int, away: np.ndarray | None = None) -> list[PaintedPlace]:
     """List where light ``k``, dark in a state, raises the likelihood most.
 
     All cells of the sky are tried through the block transport, with several fluxes each, and texels around
@@ -60,7 +60,7 @@ def best(problem: Problem, state: dict, k: int, away: np.ndarray | None = None) 
     _, directions = blocks.sky
     if point.residual is None or not len(directions):
         return []
-    trial = _Trial(problem, point, k)
+    trial = _TriedLight(problem, point, k)
     weight = blocks.summed(likelihood.weight)
     total = np.maximum(weight, 1e-30)
     compared = _Comparison(
@@ -73,7 +73,7 @@ def best(problem: Problem, state: dict, k: int, away: np.ndarray | None = None) 
     factors, unlikeliness = compared.best(blocks.cells(trial.ground).of(lights.flux[k]), trial.own)
     if away is not None:
         unlikeliness = np.where(directions @ away > PLACES_APART_COSINE, np.inf, unlikeliness)
-    places: list[Place] = []
+    places: list[PaintedPlace] = []
     texels: list[np.ndarray] = []
     for at in most_promising(directions, -unlikeliness):
         texel = trial.texel(directions[at])
@@ -90,7 +90,7 @@ def _smallest(sizes):
     return next(place for place in sizes if not place.unlikeliness > least)  # the first where none is finite
 
 
-class _Trial:
+class _TriedLight:
     """A light in place of none, in the picture of a point."""
 
     def __init__(self, problem, point, k):
@@ -117,7 +117,7 @@ class _Trial:
             at = int(np.argmin(unlikeliness))
             row, column = divmod(int(texels[at]), width)
         direction = latlong.directions(height, width)[row, column]
-        return Place(direction, np.full(3, np.log(factors[at])), float(unlikeliness[at]))
+        return PaintedPlace(direction, np.full(3, np.log(factors[at])), float(unlikeliness[at]))
 
     def lobe(self, direction, degrees):
         """Return the place of a lobe of some radius."""
@@ -130,7 +130,7 @@ class _Trial:
             light = layers.ground_light.irradiance(core[0, : layers.shape[0]])
             picture += np.float32(light * self.ground)
         factors, unlikeliness = self._best(picture.reshape(1, -1, 3))
-        return Place(direction, np.full(3, np.log(factors[0])), float(unlikeliness[0]), degrees)
+        return PaintedPlace(direction, np.full(3, np.log(factors[0])), float(unlikeliness[0]), degrees)
 
     def _best(self, pictures):
         """Return the best factors of the flux of pictures (k, pixels, 3), and -2 log likelihood then."""

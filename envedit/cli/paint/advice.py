@@ -173,7 +173,7 @@ def _best(problem, without, start, k, request, away=None):
     ``without`` is a state where it is dark, ``start`` the map's, ``away`` where it is not to be.
     """
     lights = problem.layers.lights
-    most: tuple[float, painted_places.Place | None] = 0.0, None
+    most: tuple[float, painted_places.PaintedPlace | None] = 0.0, None
     for there in painted_places.best(problem, without, k, away):
         turn = rotation_vector(lights.centres[k], there.direction)
         size = start["size"][k] if k < lights.own else lights.log_size(there.degrees)

@@ -44,7 +44,7 @@ as many as the target's."""
 
 
 @dataclass(frozen=True)
-class Edit:
+class PreparedEdit:
     """An edit that is ready to be optimised."""
 
     job: EditState  # has the map, turned, as its original
@@ -62,7 +62,7 @@ class Edit:
         :func:`.adam_solver.optimise` and :meth:`.LayersSolver.optimise`.
         """
         if self.job.newton:
-            return self.layers.optimise(self.params, resume)
+            return self.layers.optimise(resume)
         return adam_solver.optimise(self.job, self.params, resume)
 
 
@@ -81,7 +81,7 @@ class Preparation:
     # (H, W, 3), radiance of lights that layers leave as they are; the sky is then not turned
     locked: np.ndarray | None = None
     kept: np.ndarray | None = None  # (H, W), how far texels stay as they are; the sky is then not turned
-    renderer: renderers.Renderer | None = None
+    renderer: renderers.Renderer | None = None  # once :meth:`trace` has made it
     _recordings: initialization.Recordings | None = None
 
     def trace(self) -> None:
@@ -102,14 +102,14 @@ class Preparation:
             recordings = self._recorded(representation, target)
         return bool(recordings and recordings.octaves)
 
-    def edit(self, target: Target) -> Edit:
+    def edit(self, target: Target) -> PreparedEdit:
         """Prepare the edit; the sky is turned where that explains the target better.
 
         One that goes on from a solution on disk is of the map and the layers as they are.
         """
         if self._started_before:
             edit = self._prepared(target, 0.0, [], search=False)
-            edit.layers.go_on_from(self.settings.optimizer.start, edit.params)
+            edit.layers.go_on_from(self.settings.optimizer.start)
             return edit
         # ---- Maps that explain the target to its noise are taken as they are
         if self._explains(self.original, target):
@@ -133,7 +133,7 @@ class Preparation:
         still = self._prepared(target, 0.0, [])
         with self.clock("start_s"):
             self.watch.stage("comparing the edits of the turned and of the unturned sky")
-            score, other = (one.layers.settle(one.params) for one in (turned, still))
+            score, other = (one.layers.settle() for one in (turned, still))
         # As many turns as the map has columns could have been the best one.
         score += 2 * np.log(self.original.shape[1])
         chosen = still if other < score - STRONG_EVIDENCE else turned
@@ -180,20 +180,21 @@ class Preparation:
         """
         if target.spp is None:  # painted
             return False
+        seeds = Seeds(self.settings.seed)
         with self.clock("target_s"):
-            shown = self._shown(envmap, target, "turn_check")
+            shown = self._shown(envmap, target, seeds.turn_check)
             misfits = _misfits(shown, target.picture, target.known_weight)
             # A mean of n values in [0, 1] has a standard error of at most 1 / (2 sqrt(n)).
             if misfits[0] > (2 * target.spp) ** -0.5:
                 return False
-            noise = _misfits(shown, self._shown(envmap, target, "target_again"), target.known_weight)
+            again = self._shown(envmap, target, seeds.target_again)
+            noise = _misfits(shown, again, target.known_weight)
             return all(misfit <= TO_NOISE * least for misfit, least in zip(misfits, noise, strict=True))
 
     def _shown(self, envmap, target, seed):
         """Render a map with as many samples as the target had."""
-        drawn = getattr(Seeds(self.settings.seed), seed)
         spp = "auto" if self.settings.target.spp == "auto" else target.spp
-        return rendered(self.scene, envmap, spp, drawn, self.settings.renderer.cache, target.spp)[0]
+        return rendered(self.scene, envmap, spp, seed, self.settings.renderer.cache, target.spp)[0]
 
     def _idle(self, target, degrees, note):
         """Prepare an edit that leaves the turned map as it is, whatever the representation asked for."""
@@ -233,12 +234,13 @@ class Preparation:
             watch=self.watch,
             dists=self.dists,
         )
-        layers = LayersSolver(job)
+        layers = LayersSolver(job, params)
 
         # ---- Which lights, and where; which pixels count, and whether coarse grids are not enough
         if recordings and (settings.optimizer.iterations or not job.newton):
             with self.clock("start_s"):
-                params, run = self._explained(layers, params, octaves, notes, recordings.transport)
+                params, run = self._explained(layers, octaves, notes, recordings.transport)
+            layers.params = params
             octaves = octaves and self._finer(job, params, recordings, notes)
             if job.newton and not octaves:
                 layers.begun = run
@@ -257,14 +259,13 @@ class Preparation:
 
         # ---- Finer grids
         if recordings:
-            representation = representation.keeping(job.free)
-            job.representation = representation
+            job.representation = representation.keeping(job.free)
             job.free = None  # the gain keeps to them, while a light may move across the others
             notes += recordings.notes
         if octaves:
-            job.representation = representation.refined(octaves)
+            job.representation = job.representation.refined(octaves)
             params = job.representation.start() | params
-        return Edit(job, layers, params, degrees, frozen, notes)
+        return PreparedEdit(job, layers, params, degrees, frozen, notes)
 
     def _finer(self, job, params, recordings, notes):
         """Return the octaves of finer grids that are needed; pixels that do not count for them weigh less."""
@@ -322,22 +323,23 @@ class Preparation:
             None if self.kept is None else self.kept[self.rows.slice],
         )
 
-    def _explained(self, layers, params, octaves, notes, transport):
+    def _explained(self, layers, octaves, notes, transport):
         """Find the lights that explain the target, and for Adam the sky; returns parameters and the run."""
         self.watch.stage("searching for lights")
-        explanation = layers.explain(params, transport)
+        explanation = layers.explain(transport)
         subject = "the target" if layers.edit.rendered else "the paint"
         evidence = f"-2 log evidence {explanation.score:.1f}"
         notes.append(f"likeliest explanation of {subject}: {explanation.name} ({evidence})")
+        start = layers.params
         if layers.edit.newton and not octaves:
-            return params, explanation.run
+            return start, explanation.run
         self.watch.stage("solving for lights and coarse gain")
         try:
-            solved = layers.solved(params, explanation.run, transport)
+            solved = layers.solved(explanation.run, transport)
         except NumericalError:  # a start that goes nowhere is no reason to stop
-            return params, explanation.run
+            return start, explanation.run
         # What ground is lit by from elsewhere makes up for what coarse grids cannot show.
-        return params | {name: solved[name] for name in solved if name != "ground"}, explanation.run
+        return start | {name: solved[name] for name in solved if name != "ground"}, explanation.run
 
     def _recorded(self, representation, target):
         """Return what is looked through for where layers start; None for what is fitted."""

@@ -46,6 +46,7 @@ class LayersSolver:
     """Solver of one edit of layers."""
 
     edit: EditState  # what is edited
+    params: Params  # where it starts: those of the map as it is, or of a solution on coarse grids
     begun: gauss_newton.Run | None = None  # where :meth:`optimise` goes on from
     # Of paint: explanations that are less likely than the one that is solved for
     others: tuple[search.Explanation, ...] = ()
@@ -57,8 +58,8 @@ class LayersSolver:
 
     # ---- Before the steps ----------------------------------------------------------------------------------
 
-    def explain(self, params: Params, transport: LightTransport) -> search.Explanation:
-        """Return the likeliest explanation of the target through T; the parameters are those of the map."""
+    def explain(self, transport: LightTransport) -> search.Explanation:
+        """Return the likeliest explanation of the target through T."""
         edit, tried = self.edit, itertools.count(1)
         problem = edit.problem(transport)
 
@@ -72,7 +73,7 @@ class LayersSolver:
 
             explanation = search.search(
                 problem,
-                problem.state(params),
+                problem.state(self.params),
                 after_step,
                 most=edit.settings.optimizer.iterations if edit.newton else search.EXPLANATION_STEPS,
             )
@@ -83,7 +84,7 @@ class LayersSolver:
         """Return the map of an explanation of :meth:`explain`, whatever grids the gain has got since."""
         return unseen_kept(self.edit.original, explanation.point.edited)
 
-    def solved(self, params: Params, begun: gauss_newton.Run, transport: LightTransport) -> Params:
+    def solved(self, begun: gauss_newton.Run, transport: LightTransport) -> Params:
         """Return where Gauss-Newton steps end, for what Adam goes on from.
 
         Raises
@@ -93,14 +94,14 @@ class LayersSolver:
         """
         problem = self.edit.problem(transport)
         problem.evaluate(begun.state)  # another explanation may have taken its columns of T
-        return self._steps(problem, params, begun, sparing=self.edit.rendered).params
+        return self._steps(problem, begun, sparing=self.edit.rendered).params
 
-    def settle(self, params: Params) -> float:
+    def settle(self) -> float:
         """Go on from :attr:`begun` until no step and no light leads further; returns -2 log evidence."""
         most, problem = self.edit.settings.optimizer.iterations, self.edit.problem()
         problem.evaluate(self.begun.state)  # another edit may have taken its columns of T
         while self.begun is not None:
-            solution = gauss_newton.solve(problem, params, most, run=self.begun, sparing=False)
+            solution = gauss_newton.solve(problem, self.params, most, run=self.begun, sparing=False)
             self.begun = self._another(solution)
         point = problem.evaluate(solution.run.state)  # what was tried since may have taken its columns
         self.begun = solution.run
@@ -109,13 +110,13 @@ class LayersSolver:
             point = replace(point, residual=problem.residual(point.state, shown))
         return search.score(problem, solution.run, point)
 
-    def go_on_from(self, file: str, params: Params) -> None:
+    def go_on_from(self, file: str) -> None:
         """Let :meth:`optimise` go on from a solution on disk; InputError if it is not of these layers."""
-        self.begun = checkpoint.load_solution(file, self.edit.problem().state(params))
+        self.begun = checkpoint.load_solution(file, self.edit.problem().state(self.params))
 
     # ---- Steps ---------------------------------------------------------------------------------------------
 
-    def optimise(self, params: Params, resume: bool) -> tuple[Params, adam_loop.State]:
+    def optimise(self, resume: bool) -> tuple[Params, adam_loop.State]:
         """Make Gauss-Newton steps from :attr:`begun` or the map as it is, or from the checkpoint.
 
         Raises
@@ -146,14 +147,7 @@ class LayersSolver:
             while True:
                 # Paint is no noisy picture, and asks for what it shows.
                 sparing = edit.rendered and not (run and run.corrected)
-                solution = self._steps(
-                    edit.problem(),
-                    params,
-                    run,
-                    sparing,
-                    settings.iterations,
-                    keep.after_step,
-                )
+                solution = self._steps(edit.problem(), run, sparing, settings.iterations, keep.after_step)
                 following = self._following(solution, interrupt)
                 if following is None:
                     break
@@ -163,11 +157,11 @@ class LayersSolver:
         history = solution.run.history
         return solution.params, adam_loop.State(step=len(history), history=history)
 
-    def _steps(self, problem, params, run, sparing, iterations=2 * gauss_newton.MOST_STEPS, after_step=None):
+    def _steps(self, problem, run, sparing, iterations=2 * gauss_newton.MOST_STEPS, after_step=None):
         """Make steps; what those towards a photograph find of its camera is taken off the target."""
         photographed = self.edit.target.photo is not None
         judge = self._display_error if sparing and not photographed else None
-        solution = gauss_newton.solve(problem, params, iterations, after_step, run, sparing, judge)
+        solution = gauss_newton.solve(problem, self.params, iterations, after_step, run, sparing, judge)
         if photographed:
             self._take_off_camera(solution)
         return solution

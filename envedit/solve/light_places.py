@@ -101,6 +101,15 @@ def is_apart(direction: np.ndarray, others: list[np.ndarray]) -> bool:
     return all(direction @ other <= PLACES_APART_COSINE for other in others)
 
 
+class _Products(NamedTuple):
+    """Products of n pictures of lights, of strength 1, weighted: what F falls by is made of."""
+
+    mixed: np.ndarray  # (m, n), with the derivatives by the unknowns
+    pull: np.ndarray  # (n,), with the residual
+    power: np.ndarray  # (n,), with themselves
+    mean: np.ndarray  # (3, n), what they do to the mean of what was not painted
+
+
 class Places:
     """Places of lights that are dark at a point, by the problem's normal equations there.
 
@@ -111,9 +120,11 @@ class Places:
     """
 
     def __init__(self, problem: Problem, point: Point, normal: Normal):
-        self.problem, self.point = problem, point
+        self.problem, self.point, self.normal = problem, point, normal
         self._ground = lit_ground(problem, point)
-        self._model = _Model(problem, normal, problem.blocks.cells(self._ground))
+        self._cells = problem.blocks.cells(self._ground)
+        self._lower = np.linalg.cholesky(normal.hessian)
+        self._gradient = forward(self._lower, normal.gradient)
 
     def best(self, light: int) -> list[Place]:
         """List the :data:`PLACES_REFINED` best places of a light, :data:`PLACES_APART_COSINE`.
@@ -126,7 +137,7 @@ class Places:
         if not scale > 0 or not len(directions):  # so few rows that they fill no cell by half
             return []
         flux = flux / scale  # of any strength, in single precision
-        strengths, falls = self._model.of_cells(flux)
+        strengths, falls = self._of_cells(flux)
         places_refined: list[Place] = []
         for at in most_promising(directions, np.where(falls > 0, falls, -np.inf)):
             place = Place(directions[at], np.full(3, strengths[at]), float(falls[at]))
@@ -144,7 +155,7 @@ class Places:
             if self.problem.transport.capacity < (2 * reach + 1) ** 2:
                 break  # memory leaves no exact columns to refine
             texels, pictures = probed(self.problem, row, column, flux, spacing, reach, self._ground)
-            strengths, falls = self._model.of_pixels(pictures)
+            strengths, falls = self._of_pixels(pictures)
             at = int(np.argmax(falls))
             if not falls[at] > 0:
                 break
@@ -153,49 +164,33 @@ class Places:
             place, picture = Place(there, np.full(3, strengths[at]), float(falls[at])), pictures[at]
         if picture is None:
             return place
-        return replace(place, factor=self._model.of_channels(picture, place.factor))
+        return replace(place, factor=self._of_channels(picture, place.factor))
 
     def fall(self, rendering: np.ndarray) -> float:
         """Return by how much F falls with the light that makes another rendering of the point's."""
         picture = np.float32(rendering - self.point.rendering).reshape(1, -1, 3)
-        return float(self._model.of_pixels(picture)[1][0])
+        return float(self._of_pixels(picture)[1][0])
 
+    # ---- F around the point, as its normal equations have it -----------------------------------------------
 
-class _Products(NamedTuple):
-    """Products of n pictures of lights, of strength 1, weighted: what F falls by is made of."""
-
-    mixed: np.ndarray  # (m, n), with the derivatives by the unknowns
-    pull: np.ndarray  # (n,), with the residual
-    power: np.ndarray  # (n,), with themselves
-    mean: np.ndarray  # (3, n), what they do to the mean of what was not painted
-
-
-class _Model:
-    """F around a point, as its normal equations have it."""
-
-    def __init__(self, problem, normal, cells):
-        self.problem, self.normal, self.cells = problem, normal, cells
-        self._lower = np.linalg.cholesky(normal.hessian)
-        self._gradient = forward(self._lower, normal.gradient)
-
-    def of_cells(self, flux):
+    def _of_cells(self, flux):
         """Return strength and fall of F for a flux (3,) in each cell of the sky."""
-        normal, cells = self.normal, self.cells
+        normal, cells = self.normal, self._cells
         columns = zip(normal.linear.jacobian, normal.squared.T, flux, strict=True)
-        mixed = [*cells.products([j * (f * w)[:, None] for j, w, f in columns])]
+        mixed: list[Any] = [*cells.products([j * (f * w)[:, None] for j, w, f in columns])]
         if normal.lights:
             mixed.append(sum(cells.products([b * f for b, f in zip(normal.lights, flux, strict=True)])))
-        pull = sum(cells.products(list((normal.pulled * flux).T[..., None])))[0]
+        pull: Any = sum(cells.products(list((normal.pulled * flux).T[..., None])))
         power = cells.power(normal.squared * flux**2).sum(axis=0)
         of_mean = zip(normal.mean_by_blocks.T, flux, strict=True)
         mean = cells.products([b[:, None] * f for b, f in of_mean])
-        return self._best(_Products(np.concatenate(mixed), pull, power, np.concatenate(mean)))
+        return self._best(_Products(np.concatenate(mixed), pull[0], power, np.concatenate(mean)))
 
-    def of_pixels(self, pictures):
+    def _of_pixels(self, pictures):
         """Return the same for pictures (n, pixels, 3)."""
         return self._best(self._products(pictures))
 
-    def of_channels(self, picture, strengths):
+    def _of_channels(self, picture, strengths):
         """Return the best strengths (3,) of a picture (pixels, 3) that has one in each channel.
 
         At least :data:`FAINTEST` of the strongest; those given, where they have no solution.

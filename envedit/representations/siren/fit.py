@@ -23,7 +23,8 @@ import numpy as np
 from envedit import config
 from envedit.core.array_cache import DiskCache, holds
 from envedit.core.arrays import tensor
-from envedit.core.errors import InputError, NumericalError, place_of
+from envedit.core.errors import NumericalError
+from envedit.core.radiance import require_radiance
 from envedit.core.types import Params
 from envedit.losses import losses, metrics, optimizer, ssim
 from envedit.representations.base import EPSILON, not_negative
@@ -111,8 +112,7 @@ def fit(
     network, settings = network or config.Representation(), settings or config.Fit()
     settings = unpolished(settings) if settings.polish == "never" else settings
     image = np.ascontiguousarray(image, np.float32)
-    if not (good := np.isfinite(image) & (image >= 0)).all():
-        raise InputError(f"fit: the texel at {place_of(~good)} is not finite or is negative: repair it")
+    require_radiance(image, "fit")
 
     # ---- The same fit from disk
     cache = DiskCache(folder if settings.cache else None)

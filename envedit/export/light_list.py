@@ -22,7 +22,8 @@ from envedit.representations.layers.separation import Light, Separation, separat
 FARTHEST = math.pi + 1
 """Cost up to which two lights may be one: any angle at equal flux, or half a turn and a factor e of flux."""
 SAME_DEGREES = 2.0
-"""Angle up to which a light that an edit has moved is one of the list: both are separated from one map."""
+"""Angle up to which a light that an edit has moved is one of the list, as both are separated from one map,
+and up to which two lights are one whatever their flux."""
 MOST_NAMED = 8
 """Lights that :func:`summary` names."""
 _POINTS = 100_000  # of a light, by which its radii are measured
@@ -203,7 +204,8 @@ def matched(
             there[near.argmax()] = now
             flux[0][near.argmax()] += math.log(max(factor, 1e-30))
     apart = np.arccos(np.clip(there @ end.T, -1, 1))
-    partner = _paired(apart + np.abs(flux[0][:, None] - flux[1]))
+    change = np.abs(flux[0][:, None] - flux[1])
+    partner = _paired(apart + np.minimum(change, FARTHEST - math.radians(SAME_DEGREES)))
     moved = np.degrees(np.arccos(np.clip(start @ end.T, -1, 1)))
 
     # ---- Number them: those before, then those added

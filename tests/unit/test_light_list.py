@@ -66,6 +66,13 @@ def test_a_light_that_an_edit_has_put_elsewhere_is_the_same_light():
     assert [row[0] for row in numbers(found)] == [1, 2]
 
 
+@pytest.mark.parametrize("factor", [1e-6, 1e6])
+def test_a_light_in_its_place_is_the_same_light_whatever_its_flux(factor):
+    before = [light(30, 40), light(200, 10)]
+    after = [light(31, 40, factor), light(206, 10, factor)]
+    assert [row[:2] for row in numbers(light_list.matched(before, after))] == [(1, False), (3, True)]
+
+
 def test_a_turn_goes_the_way_of_the_map():
     envmap = np.full((HEIGHT, WIDTH, 3), 0.2, np.float32)
     envmap[9, 50], envmap[6, 20] = 900, 500

@@ -64,8 +64,7 @@ class Progress:
         if now - self._last_line >= LINE_SECONDS:
             self._last_line = now
             first_done, first_time = self._first_update
-            seconds = now - first_time
-            speed = f", {(done - first_done) / seconds:.3g}/s" if seconds > 0 else ""
+            speed = f", {(done - first_done) / (now - first_time):.3g}/s" if done > first_done else ""
             print(f"{self._stage}: {done}/{total}{speed} {text}".rstrip(), file=self.stream, flush=True)
 
     def _close(self):

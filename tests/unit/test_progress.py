@@ -61,6 +61,17 @@ def test_what_was_done_before_is_not_taken_for_speed(kind, clock, monkeypatch):
         assert stream.getvalue() == "fitting\nfitting: 530/1000, 5/s\n"
 
 
+def test_a_count_that_begins_again_has_no_speed(clock):
+    stream = io.StringIO()
+    with contextlib.redirect_stderr(stream), Progress() as shown:
+        shown.stage("editing")
+        shown.update(12, 12)
+        for done in (9, 12):
+            clock[0] += 6
+            shown.update(done, done, "trying lights")
+    assert stream.getvalue() == "editing\nediting: 9/9 trying lights\nediting: 12/12 trying lights\n"
+
+
 def test_an_update_at_once_does_not_divide_by_zero(clock, monkeypatch):
     monkeypatch.setattr(progress, "LINE_SECONDS", 0.0)
     stream = io.StringIO()

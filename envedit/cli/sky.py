@@ -70,7 +70,10 @@ def _sun(arguments):
         raise ConfigError("--place and --date are needed together: where, and when")
     latitude, longitude = arguments.place
     if not (abs(latitude) <= 90 and abs(longitude) <= 360):
-        raise ConfigError(f"--place: got {latitude:g} {longitude:g}, expected degrees")
+        raise ConfigError(
+            f"--place: got {latitude:g} {longitude:g}, expected a latitude from -90 to 90 and a longitude "
+            "from -360 to 360, degrees"
+        )
     moment = sun_position.moment(arguments.date)
     azimuth, elevation = sun_position.sun_position(latitude, longitude, moment)
     if elevation < 0:

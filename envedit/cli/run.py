@@ -60,7 +60,7 @@ def load(name: str, preset: str | None, overrides: Iterable[str]) -> tuple[confi
     try:
         os.stat(file)
     except FileNotFoundError:
-        close = difflib.get_close_matches(name, shipped.configurations(), 1)
+        close = difflib.get_close_matches(name, [*shipped.configurations(), *shipped.scenes()], 1)
         hint = f"did you mean the shipped {close[0]}?" if close else "to write one: envedit init"
         raise ConfigError(f"{name}: no such configuration file; {hint}") from None
     except (OSError, ValueError):  # reading it will explain

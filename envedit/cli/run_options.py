@@ -139,7 +139,8 @@ def quick(arguments: argparse.Namespace) -> list[str]:
         "rotate": (("target.rotate_degrees", arguments.rotate),),
     }
     options = [name for name in keys if getattr(arguments, name) is not None]
-    if options and not is_scene(arguments.config):
+    known = os.path.exists(arguments.config) or arguments.config in shipped.configurations()
+    if options and known and not is_scene(arguments.config):
         key = keys[options[0]][-1][0]
         raise ConfigError(
             f"--{options[0]}: got it beside a configuration, expected it beside a scene: "

@@ -101,10 +101,12 @@ def test_a_file_goes_before_a_shipped_name_and_a_folder_does_not(here):
     ("quikstart", "did you mean the shipped quickstart?"),
     ("quickstart.toml", "did you mean the shipped quickstart?"),
     ("edits/move_shadows", "did you mean the shipped edits/move_shadow?"),
+    ("mate", "did you mean the shipped matte?"),
     ("my.toml", "to write one: envedit init"),
 ])  # fmt: skip
-def test_a_configuration_that_is_not_there(wrong, says, here, capsys):
-    assert run.main([wrong]) == 2
+@pytest.mark.parametrize("options", [[], ["--rotate", "9"]])
+def test_a_configuration_that_is_not_there(wrong, says, options, here, capsys):
+    assert run.main([wrong, *options]) == 2
     assert capsys.readouterr().err == f"envedit: {wrong}: no such configuration file; {says}\n"
 
 

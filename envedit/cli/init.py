@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 from pathlib import Path
 
 from envedit.cli.console import Console, exit_code, make_parser
@@ -92,7 +93,7 @@ def _write(arguments):
     text = _aligned(text)
     config.loads(text, file.absolute().parent, str(file))
     write_atomically(file, text.encode())
-    print(f"{arguments.out}: written; edit it, then: envedit run {arguments.out}")
+    print(f"{arguments.out}: written; edit it, then: envedit run {shlex.quote(arguments.out)}")
     return 0
 
 

@@ -21,6 +21,11 @@ def test_the_file_loads_to_the_defaults_that_it_spells_out(here, capsys):
     assert written.target.degrees == config.Target().degrees
 
 
+def test_the_command_that_it_names_can_be_pasted(here, capsys):
+    assert init.main(["--out", "my edit.toml"]) == 0
+    assert capsys.readouterr().out.endswith("envedit run 'my edit.toml'\n")
+
+
 @pytest.mark.parametrize("name", shipped.scenes())
 def test_every_shipped_scene_is_taken_by_its_name(name):
     assert init.main([name]) == 0

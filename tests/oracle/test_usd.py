@@ -483,8 +483,11 @@ def test_what_is_missing_or_damaged_is_named(tmp_path):
     UsdGeom.Mesh.Get(stage, "/square").GetFaceVertexIndicesAttr().Set([0, 1, 2, 9])
     assert "do not fit together" in str(refusal(stage))
     (tmp_path / "text.usda").write_text("no USD")
-    with pytest.raises(InputError, match="cannot be read as USD"):
+    with pytest.raises(InputError, match=r"cannot be read as USD \(.*not a valid usda layer\)"):
         scene.load(tmp_path / "text.usda", 8)
+    (tmp_path / "typo.usda").write_text('#usda 1.0\ndef Sphere "ball"\n{\n    double radius 1\n}\n')
+    with pytest.raises(InputError, match=r"cannot be read as USD \(.*typo\.usda:4:"):
+        scene.load(tmp_path / "typo.usda", 8)
     with pytest.raises(InputError, match="no such file"):
         scene.load(tmp_path / "none.usda", 8)
 

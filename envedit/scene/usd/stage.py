@@ -80,8 +80,9 @@ def convert(file: str, xml: str, camera: str = "", time: float | None = None) ->
     """
     try:
         stage = Usd.Stage.Open(file)
-    except Tf.ErrorException:
-        raise InputError(f"{file}: cannot be read as USD; is this the right file?") from None
+    except Tf.ErrorException as error:
+        reason = " ".join(error.args[0].commentary.split())
+        raise InputError(f"{file}: cannot be read as USD ({reason}); is this the right file?") from None
     code = stage.GetStartTimeCode() if stage.HasAuthoredTimeCodeRange() else None
     moment = code if time is None else time
     when = Usd.TimeCode.EarliestTime() if moment is None else Usd.TimeCode(moment)

@@ -65,7 +65,7 @@ def read(
     file = info["path"]
     facts = initial_rendering.stated_origin(file, info, exported)
     warnings = [f"{file}: {line}" for line in info["warnings"]]
-    spread = _spread_of_resampling(file, pixels.shape, shape, warnings)
+    spread = _spread_of_resampling(file, pixels.shape, initial, shape, warnings)
     check_finite(file, pixels, "repair it in the program it came from (half floats end at 65504)")
 
     # ---- Values, alpha and clipped pixels, at the size of the rendering
@@ -194,7 +194,7 @@ def read_mask(file: FilePath, shape: Shape) -> np.ndarray:
     return weight.astype(np.float32)
 
 
-def _spread_of_resampling(file, size, shape, warnings):
+def _spread_of_resampling(file, size, initial, shape, warnings):
     """Check a picture's size; returns over how many pixels resampling mixes the rendering's, 0 without.
 
     Editors resample with filters of at most three lobes, each as wide as the larger of the two pixels.
@@ -204,12 +204,13 @@ def _spread_of_resampling(file, size, shape, warnings):
         return 0
     sizes = f"{file}: is {columns}x{rows} pixels, the rendering is {width}x{height}: "
     if abs(columns * height - rows * width) > max(height, width):
-        raise InputError(sizes + "another aspect; paint on the picture that --export-initial writes")
+        raise InputError(sizes + "another aspect; crop it, or paint on what --export-initial writes")
     if max(columns, width) > MOST_RESIZED * min(columns, width):
         raise InputError(f"{sizes}more than {MOST_RESIZED} times apart; save it at the size of the export")
-    warnings.append(
-        f"{sizes}resampled, by which faint or thin paint is lost: better keep the size of the export"
-    )
+    if initial is not None:  # paint is looked for
+        warnings.append(
+            f"{sizes}resampled, by which faint or thin paint is lost: better keep the size of the export"
+        )
     return int(np.ceil(3 * max(1, height / rows, width / columns)))
 
 

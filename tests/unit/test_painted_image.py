@@ -469,6 +469,7 @@ def test_a_resized_picture_is_resampled(method, factor, initial, tmp_path):
     assert found.picture[around].tobytes() == initial[around].tobytes()
     assert np.abs(tonemap(found.picture[inside]) - tonemap(wanted[inside])).mean() < 0.01
     assert f"is {size[0]}x{size[1]} pixels, the rendering is 83x60: resampled" in told(found)
+    assert "resampled" not in told(painted_image.read(tmp_path / "p.png", SIZE, "gamma"))  # no paint
 
 
 def test_a_resized_layer_keeps_its_colour(initial, tmp_path):

@@ -135,7 +135,7 @@ class Result:
         rows, columns, _ = self.render.shape
         parts = [f"map {width}x{height}", f"rendering {columns}x{rows}"]
         before, after = (self.metrics[name] for name in ("initial", "render"))
-        if self.metrics["iterations"]:
+        if before["log_rmse"]:  # with a target
             first, last = (metrics.score(one, (before, after)) for one in (before, after))
             parts.append(f"{first} before, {last} after {self.metrics['iterations']} steps")
         if self.warnings:

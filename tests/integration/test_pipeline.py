@@ -760,6 +760,7 @@ def test_noise_of_the_target_does_not_spoil_a_turn(tmp_path, rng):
     found = pipeline.run(settings)
     assert found.envmap.tobytes() == latlong.rotate(picture, 90).tobytes()
     assert any("the rest is noise, nothing else changed" in line for line in found.notes)
+    assert f"dB before, {found.metrics['render']['psnr']:.1f} dB after 0 steps" in repr(found)
     # What remains is noise: the right map leaves as much.
     assert found.metrics["ceiling"]["psnr"] == pytest.approx(found.metrics["render"]["psnr"], abs=1e-6)
 

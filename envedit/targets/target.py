@@ -127,7 +127,7 @@ def make(
 
     InputError if a file cannot be read, a picture does not fit the film, or the other map is brighter than
     :data:`.radiance.BRIGHTEST`; a picture that is so bright is cut there, with a warning. ConfigError if a
-    view is not the scene's, or is given twice; as of :func:`.extensions.load`.
+    view is not the scene's, or is given twice, or strokes paint nothing; as of :func:`.extensions.load`.
     """
     hidden = hidden_pixels(scene)
     made = _made(settings, scene, envmap, picture, mask, other, hidden)
@@ -176,9 +176,9 @@ def _of_paint(settings, scene, envmap, picture, mask, hidden):
     else:
         painted = painted_strokes(scene, initial, chosen.strokes, chosen.display_tonemap)
         if not painted.coverage.any():
-            what = "; ".join(painted.warnings) or "none of them paints anything"
-            raise InputError(f"target.strokes: {what}")
-        source = f"painted: {len(chosen.strokes)} strokes on the initial rendering"
+            raise ConfigError("; ".join(painted.warnings))
+        count = len(chosen.strokes)
+        source = f"painted: {count} stroke{'s' * (count != 1)} on the initial rendering"
     if chosen.kind == "image" and mask is None and not chosen.masks:
 
         def again():

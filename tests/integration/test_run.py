@@ -553,6 +553,14 @@ def test_the_export_says_how_the_file_is_named_in_a_configuration(tmp_path, rng,
     assert f'file = "{tmp_path / "b.png"}"' in capsys.readouterr().out
 
 
+def test_strokes_that_paint_nothing_are_a_mistake_of_the_configuration(tmp_path, rng, capsys):
+    strokes = [{"type": "light", "ellipse": [9, 9, 1, 1]}, {"type": "blur", "radius": 0.1, "opacity": 0}]
+    assert call(world(tmp_path, rng, target={"kind": "strokes", "strokes": strokes}), "--dry-run") == 2
+    says = capsys.readouterr().err.splitlines()[-1]
+    assert says.startswith("envedit: target.strokes[0] (light): lies outside the ")
+    assert says.endswith("; target.strokes[1] (blur): opacity 0, nothing was painted")
+
+
 def test_a_dry_run_writes_the_target_and_nothing_else(tmp_path, rng, capsys):
     stroke = {"type": "light", "rectangle": [0, 0, 0.5, 1], "amount": 0.25, "color": "#ffffff"}
     path = world(tmp_path, rng, target={"kind": "strokes", "strokes": [stroke]})
@@ -560,7 +568,7 @@ def test_a_dry_run_writes_the_target_and_nothing_else(tmp_path, rng, capsys):
     assert call(path, "--export-initial", tmp_path / "initial.exr", "--quiet") == 0
     assert call(path, "--dry-run") == 0
     out, err = capsys.readouterr()
-    assert "1 strokes on the initial rendering" in out and "dry_run.png" in out
+    assert "1 stroke on the initial rendering" in out and "dry_run.png" in out
     after = content(tmp_path)
     made = {"initial.exr", "initial.exr.envedit.json", "c_out/dry_run.png", "c_out/dry_run.exr"}
     assert after.keys() - before.keys() == made

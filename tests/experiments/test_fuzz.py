@@ -11,7 +11,6 @@ from envedit.config import Config
 from experiments.fuzz import damage, drive, experiment, kinds, whole
 from experiments.fuzz.declared import declared as declared_bytes
 from experiments.harness import Case, Done, rows_of, table
-from tests.oracles.tiers import slow_but
 
 linux = pytest.mark.skipif(sys.platform != "linux", reason="memory of a process is read from /proc")
 
@@ -19,10 +18,10 @@ linux = pytest.mark.skipif(sys.platform != "linux", reason="memory of a process 
 # ---- the package -------------------------------------------------------------------------------------------
 @pytest.mark.slow
 @linux
-@pytest.mark.parametrize(("what", "cases"), slow_but([
+@pytest.mark.parametrize(("what", "cases"), [
     ("map", 80), ("toml", 40), ("painted", 30), ("weights", 30), ("scene", 30), ("asset", 8), ("entry", 8),
     ("checkpoint", 40),
-], "map", "toml"))  # fmt: skip
+])  # fmt: skip
 def test_damaged_files_are_read_or_refused(what, cases, tmp_path):
     found = drive.piece(Config(), tmp_path, what, 0, cases)
     counts, errors = found["counts"], found["errors"]
@@ -37,10 +36,17 @@ def test_damaged_files_are_read_or_refused(what, cases, tmp_path):
     assert bool(errors["ConfigError"]) <= (what in ("toml", "scene"))
 
 
+@pytest.fixture(scope="module")
+def reader():
+    """A worker that reads maps and painted pictures."""
+    with drive.Worker("map") as process:
+        yield process
+
+
 @pytest.mark.slow
 @linux
 @pytest.mark.parametrize("name", ["ours.exr", "flat.hdr", "rgb8.png"])
-def test_a_whole_image_takes_no_more_than_the_stated_multiple(tmp_path, name):
+def test_a_whole_image_takes_no_more_than_the_stated_multiple(tmp_path, name, reader):
     """Here without the room that small files have, so that the multiple itself is tested."""
     shape = (512, 1024)
     if name == "ours.exr":
@@ -56,12 +62,11 @@ def test_a_whole_image_takes_no_more_than_the_stated_multiple(tmp_path, name):
     declared = declared_bytes(data)
     assert declared >= 12 * shape[0] * shape[1]
     small = {"ours.exr": "map", "flat.hdr": "map", "rgb8.png": "painted"}[name]
-    with drive.Worker("map") as process:
-        for warm, raw in kinds.seeds(small):
-            if warm == name:
-                (tmp_path / f"small-{name}").write_bytes(raw)
-                process.read(tmp_path / f"small-{name}", 0, len(raw), limited=False)
-        answer = process.read(tmp_path / name, 0, declared)
+    for warm, raw in kinds.seeds(small):
+        if warm == name:
+            (tmp_path / f"small-{name}").write_bytes(raw)
+            reader.read(tmp_path / f"small-{name}", 0, len(raw), limited=False)
+    answer = reader.read(tmp_path / name, 0, declared)
     assert answer["outcome"] == "read", answer
     assert declared / 2 < answer["peak"] < 8 * declared
 
@@ -69,15 +74,14 @@ def test_a_whole_image_takes_no_more_than_the_stated_multiple(tmp_path, name):
 @pytest.mark.slow
 @linux
 @pytest.mark.parametrize("field", ["dataWindow", "displayWindow", "both"])
-def test_an_image_two_billion_texels_wide_takes_no_memory(tmp_path, field):
+def test_an_image_two_billion_texels_wide_takes_no_memory(tmp_path, field, reader):
     raw = bytearray(dict(kinds.seeds("map"))["ours.exr"])
     for name in ("dataWindow", "displayWindow"):
         if field in (name, "both"):
             at = raw.index(name.encode() + b"\0box2i\0") + len(name) + 11
             struct.pack_into("<4i", raw, at, 0, 0, 2**31 - 2, 15)
     (tmp_path / "wide.exr").write_bytes(raw)
-    with drive.Worker("map") as process:
-        answer = process.read(tmp_path / "wide.exr", 0, 0)
+    answer = reader.read(tmp_path / "wide.exr", 0, 0)
     assert answer["outcome"] == "refused" and answer["peak"] < 8 << 20, answer
 
 
@@ -123,26 +127,36 @@ def read(path, index):
 """
 
 
+@pytest.fixture(scope="module")
+def bad_reader(tmp_path_factory):
+    """A worker whose reader does what a file says; it has minutes on the clock."""
+    folder = tmp_path_factory.mktemp("bad")
+    (folder / "bad.py").write_text(BAD)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", str(folder))
+        with drive.Worker("bad:read", seconds=0.5, patience=240) as process:
+            yield process
+
+
 @pytest.mark.slow
 @linux
-@pytest.mark.parametrize(("kind", "outcome", "words"), slow_but([
+@pytest.mark.parametrize(("kind", "outcome", "words"), [
     ("crashed", "crashed", "SIGSEGV"), ("hung", "hung", "of processor time"),
     ("stuck", "hung", "of wall time"), ("traceback", "traceback", "KeyError"),
     ("nameless", "unclear", "does not name the file"), ("control", "unclear", "control characters"),
     ("lengthy", "unclear", "1 lines, "), ("wrong", "wrong", "not finite"),
     ("memory", "memory", "MiB for 0 bytes"), ("address", "memory", "not enough memory"),
     ("printed", "printed", "from C"), ("warned", "printed", "from Python"),
-], "crashed", "memory", "printed"))  # fmt: skip
-def test_every_fault_is_seen(tmp_path, monkeypatch, kind, outcome, words):
-    (tmp_path / "bad.py").write_text(BAD)
+])  # fmt: skip
+def test_every_fault_is_seen(tmp_path, monkeypatch, kind, outcome, words, bad_reader):
     (tmp_path / "case").write_text(kind)
     (tmp_path / "good").write_text("refused")
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    # Minutes on the clock, but for what is to run into that limit.
-    with drive.Worker("bad:read", seconds=0.5, patience=30 if kind == "stuck" else 240) as process:
-        answer = process.read(tmp_path / "case", 0, 0)
-        assert answer["outcome"] == outcome and words in answer["error"]
-        assert process.read(tmp_path / "good", 1, 0)["outcome"] == "refused"  # and the next one is read
+    with monkeypatch.context() as patch:
+        if kind == "stuck":
+            patch.setattr(bad_reader, "patience", 10)
+        answer = bad_reader.read(tmp_path / "case", 0, 0)
+    assert answer["outcome"] == outcome and words in answer["error"]
+    assert bad_reader.read(tmp_path / "good", 1, 0)["outcome"] == "refused"  # and the next one is read
 
 
 @pytest.mark.slow

@@ -92,7 +92,7 @@ def test_the_solution_is_that_of_coordinate_descent(dense, envmap, rng, monkeypa
     target = np.clip(render(dense, envmap) * rng.choice([0.3, 1.5], size=(*PIXELS, 3)), 0, 0.99)
     weight = rng.random((*PIXELS, 1))
     monkeypatch.setattr(feasibility, "SHARP_SAMPLES", 0)  # every texel by itself
-    monkeypatch.setattr(feasibility, "STEPS", 2000)
+    monkeypatch.setattr(feasibility, "STEPS", 100)
     found = feasibility.reachable(dense, envmap, target, weighed(weight))
     request = feasibility._Request(render(dense, envmap), target, weighed(weight), np.ones(PIXELS))
     w = request.weights(found.picture)  # as linearised where the solution is

@@ -186,6 +186,7 @@ def test_a_map_is_read_off_its_mirror(mirror):
     assert np.abs(found - expected)[~behind].mean() < 0.002
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not TRUTH.is_dir(), reason="ENVEDIT_DATA has no evaluation/ground_truth/stylelight")
 @pytest.mark.parametrize("name, most", [("diffuse", 0.15), ("matte silver", 0.13), ("mirror", 0.25)])
 def test_spheres_are_those_of_the_ground_truth(name, most):

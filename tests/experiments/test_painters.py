@@ -44,6 +44,7 @@ def test_a_painted_shadow_is_that_of_the_map_turned_for_it(view, picture):
     assert after < 0.5 * before
 
 
+@pytest.mark.slow
 def test_without_a_sun_there_is_no_shadow_to_paint(view, picture):
     dull = View(view.scene, np.ones((32, 64, 3), np.float32))
     assert all(painter(dull, picture) is None for painter in SHADOWS.values())

@@ -81,6 +81,7 @@ def test_the_paper_s_numbers_are_complete_and_agree_with_each_other():
 
 
 # ---- jobs --------------------------------------------------------------------------------------------------
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "paper", "ours"), [
     ("table1", 9, 11), ("table2", 9, 11), ("table3", 9 * 4 * 3, 11 * 4 * 3),
 ])  # fmt: skip

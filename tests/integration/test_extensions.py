@@ -45,6 +45,7 @@ def installed(tmp_path, monkeypatch):
     sys.modules.pop("one_colour", None)
 
 
+@pytest.mark.slow
 def test_a_package_adds_three_kinds(installed):
     envmap = sky(np.random.default_rng(0), 8, 16)
     kinds = {"representation": "one_colour", "renderer": "few_bounces", "target": "brighter"}

@@ -27,6 +27,7 @@ from tests.oracles.dense_transport import DenseTransport
 from tests.oracles.maps import angle
 from tests.oracles.matrix_renderer import same
 from tests.oracles.plain import plain_display
+from tests.oracles.tiers import slow_but
 
 pytestmark = pytest.mark.usefixtures("own_core")
 
@@ -161,7 +162,8 @@ def names_of(problem, normal):
     return ["gain"] * (3 * problem.nodes) + [name for name, _, _ in normal.linear.named]
 
 
-@pytest.mark.parametrize("sigma", [0.02, 0.1, 1.0])  # most residuals in the linear part, some, none
+# Most residuals are in the linear part, some, none.
+@pytest.mark.parametrize("sigma", slow_but([0.02, 0.1, 1.0], 0.02))
 def test_gradient_is_that_of_finite_differences(case, sigma):
     problem, _, start, state = case
     point = problem.evaluate(state)
@@ -170,7 +172,7 @@ def test_gradient_is_that_of_finite_differences(case, sigma):
     assert_gradient(problem, start, state, sigma)
 
 
-@pytest.mark.parametrize("sigma", [0.02, 1.0])
+@pytest.mark.parametrize("sigma", slow_but([0.02, 1.0], 0.02))
 def test_gradient_of_a_photograph_is_that_of_finite_differences(photographed, sigma):
     problem, _, start, state = photographed
     clipped = problem.clipped
@@ -650,6 +652,7 @@ def test_a_target_that_no_light_can_make(rng):
     assert np.abs(last.state["gain"]).max() < 12
 
 
+@pytest.mark.slow
 def test_pixels_that_nothing_explains_have_little_say(rng):
     image = clouds(rng)
     transport = DenseTransport.random(rng, FILM, GRID, even=0.6)
@@ -954,6 +957,7 @@ def saturating(rng, kept):
     return Problem(layers, transport, image, target, saturates=True), params
 
 
+@pytest.mark.slow
 def test_saturation_of_the_target_is_found(rng):
     problem, params = saturating(rng, 0.3)
     found = solve(known_to(problem, 0.002), params)

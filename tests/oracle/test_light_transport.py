@@ -395,6 +395,7 @@ def test_capacity_is_never_exceeded(lamp_scene):
     assert np.isfinite(picture(none, sun(4, 0))).all() and np.isfinite(gradient).all()
 
 
+@pytest.mark.slow
 def test_columns_of_maps_that_were_bright_lately_stay_longest(lamp_scene):
     """What is compared with a map that was rendered before keeps the columns that it was rendered with."""
     pixels = lamp_scene.width * lamp_scene.height

@@ -164,6 +164,7 @@ def test_measures_match_the_authors_code(recorded, dists, lpips, backbones, meas
     )
 
 
+@pytest.mark.slow
 def test_trained_networks_score_as_the_authors_programs(data):
     """Ten pairs, the weights that ``envedit weights`` fetches; see experiments/references/perceptual.py."""
     folder = data / "weights"

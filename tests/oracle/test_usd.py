@@ -20,6 +20,7 @@ from envedit.images import images
 from envedit.scene import scene
 from envedit.scene.usd import conversion
 from envedit.scene.usd import stage as usd_stage
+from tests.oracles.tiers import slow_but
 
 pytestmark = pytest.mark.usefixtures("own_cache")
 
@@ -147,8 +148,8 @@ def refusal(stage):
 # ---- Camera ------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("offset", [(0.0, 0.0), (8.0, -3.0)])
-@pytest.mark.parametrize("projection", ["perspective", "orthographic"])
+@pytest.mark.parametrize("offset", [(0.0, 0.0), pytest.param((8.0, -3.0), marks=pytest.mark.slow)])
+@pytest.mark.parametrize("projection", slow_but(["perspective", "orthographic"], "perspective"))
 def test_a_camera_puts_a_point_where_usd_does(offset, projection, tmp_path):
     stage = new_stage(tmp_path)
     camera = add_camera(stage, move=(1, 2, 9), turns=[((0, 1, 0), 20), ((1, 0, 0), -15)], scale=3.0)
@@ -199,7 +200,7 @@ def test_cameras_are_named_where_there_are_several(tmp_path, capsys):
 # ---- Light -------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("unit", [1.0, 0.01])
+@pytest.mark.parametrize("unit", slow_but([1.0, 0.01], 0.01))
 def test_a_white_dome_lights_a_white_plane_with_its_radiance(unit, tmp_path):
     stage = new_stage(tmp_path, unit=unit)
     add_square(stage, half=100 / unit)
@@ -327,6 +328,7 @@ def test_light_of_a_lamp_far_away(kind, normalize, tmp_path):
 # ---- Meshes ------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_instances_stand_where_copies_would(tmp_path):
     pictures = []
     places = [(-0.9, -0.5, 0), (0.8, 0.4, 0.5)]
@@ -359,6 +361,7 @@ def test_instances_stand_where_copies_would(tmp_path):
     assert pictures[0].std() > 0.1
 
 
+@pytest.mark.slow
 def test_subsets_have_their_materials_and_rows_of_textures_go_up(tmp_path):
     """The lower half of the square is red; the upper has a texture whose first row is white, others black."""
     stage = lit_stage(tmp_path)
@@ -408,6 +411,7 @@ def test_what_is_hidden_or_a_guide_is_left_out(tmp_path):
     assert len(scene.load(made.xml, 8).mi.shapes()) == 3
 
 
+@pytest.mark.slow
 def test_one_channel_of_a_texture_that_is_moved_scaled_and_turned(tmp_path):
     """Alpha is 0, 0.25, 0.5, 0.75 in four columns; a texture turned by 90 degrees runs along y instead."""
     stage = lit_stage(tmp_path)
@@ -462,6 +466,7 @@ def test_glass_gold_and_a_cut_out(tmp_path):
 # ---- Errors ------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_what_is_missing_or_damaged_is_named(tmp_path):
     stage = new_stage(tmp_path)
     add_camera(stage)
@@ -591,6 +596,7 @@ def test_the_extra_is_named_where_it_is_not_installed(tmp_path, monkeypatch, cap
     assert "pip install '.[usd]'" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_what_a_run_leaves_changes_nothing_of_the_file_but_its_sky(tmp_path, rng):
     """The stage above the user's file is a scene again, and is rendered as the run rendered its result."""
     images.write_exr(tmp_path / "sky.exr", rng.random((8, 16, 3), np.float32) + 0.1)

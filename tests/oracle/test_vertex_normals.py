@@ -59,6 +59,7 @@ def test_those_of_a_file_stay(loaded, rng):
     np.testing.assert_allclose(found, own[at], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_face_without_area_counts_for_nothing(loaded):
     _, _, found = loaded([(0, 0, 0), (1, 0, 0), (0, 1, 0), (2, 0, 0)], [(0, 1, 2), (0, 1, 3)])
     assert np.isfinite(found).all()

@@ -85,6 +85,7 @@ def test_an_even_map_stays_even(value):
     np.testing.assert_allclose(found, envmap, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_the_command_keeps_format_and_colour_space_and_writes_a_backplate(rng, capsys, here):
     sky = sunny(rng, peak=500.0)
     images.write_exr("sky.exr", sky, half=True, chromaticities=primaries.ACES_AP1)

@@ -54,13 +54,15 @@ def test_what_lies_below_is_told_by_what_it_shows(rng):
     assert kind_of(np.ones((3, 2, 3), np.float32)) == "keep"
 
 
-@pytest.mark.parametrize("width", [128, 256])
-def test_public_maps_are_told_apart(width, data):
+@pytest.mark.slow
+def test_public_maps_are_told_apart(data):
     for folder, kind in (("puresky", "mirror"), ("hdri", "keep")):
         files = sorted(data.glob(f"{folder}/*.hdr"))
         assert files
         for file in files:
-            assert kind_of(images.load_envmap(str(file), width)[0]) == kind, file.name
+            image, _ = images.load_envmap(str(file))
+            for width in (128, 256):
+                assert kind_of(latlong.resize(image, width // 2, width)) == kind, (file.name, width)
 
 
 @pytest.mark.parametrize("kind", ("mirror", "keep"))
@@ -173,6 +175,7 @@ def moved(sun=(24, 20)):
     return image, made, params, params | {"turn": tensor(turn / made.scales["turn"])}
 
 
+@pytest.mark.slow
 def test_layers_give_a_whole_map_back_and_have_no_edge_when_the_sun_moves():
     image, made, params, away = moved()
     assert made.decode(params).numpy()[32:].tobytes() == image[32:].tobytes()

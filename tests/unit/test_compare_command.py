@@ -41,6 +41,7 @@ def test_a_map_and_itself(rng, said, tmp_path):
     assert json.loads((tmp_path / "a_b_compared" / "compare.json").read_text())["identical"]
 
 
+@pytest.mark.slow
 def test_a_stop_brighter_and_turned(rng, said):
     envmap = sunny(rng)
     found = said(envmap, 2 * latlong.rotate(envmap, 90))
@@ -52,6 +53,7 @@ def test_a_stop_brighter_and_turned(rng, said):
     assert light["moved_degrees"] == pytest.approx(np.degrees(arc), abs=1)
 
 
+@pytest.mark.slow
 def test_another_size_and_a_black_map(rng, said):
     envmap = sunny(rng)
     found = said(envmap, latlong.resize(envmap, 16, 32))

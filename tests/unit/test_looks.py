@@ -58,6 +58,7 @@ def test_a_map_has_the_key_light_that_the_look_says(sun):
     assert np.degrees(np.arccos(centre @ toward)) < 1
 
 
+@pytest.mark.slow
 def test_the_look_of_an_edit_is_what_it_did():
     before = sky(True)
     look = look_transfer.of_edit(before, look_transfer.apply(before, EVENING))
@@ -71,6 +72,7 @@ def test_the_look_of_an_edit_is_what_it_did():
     assert look.saturation == pytest.approx(1.3, abs=0.15)
 
 
+@pytest.mark.slow
 def test_no_edit_is_a_look_that_changes_nothing():
     before = sky(True)
     look = look_transfer.of_edit(before, before)
@@ -79,6 +81,7 @@ def test_no_edit_is_a_look_that_changes_nothing():
     assert look_transfer.apply(before, EVENING, amount=0) is before
 
 
+@pytest.mark.slow
 def test_a_turned_sky_is_turned_until_its_key_light_stands_there():
     before = sky(True)
     look = look_transfer.of_edit(before, latlong.rotate(before, 45), 45)
@@ -89,6 +92,7 @@ def test_a_turned_sky_is_turned_until_its_key_light_stands_there():
     assert np.median(np.abs(made / expected - 1)) < 0.02
 
 
+@pytest.mark.slow
 def test_between_two_looks_the_light_goes_along_a_great_circle():
     noon = Look(lights={"key": RoleLight(100.0, 60.0, 3.0, 0.0, (1.0, 1.0, 1.0))})
     stops = {}
@@ -144,6 +148,7 @@ def test_a_file_holds_the_look_and_a_bad_one_names_its_key(tmp_path):
             looks.read(path)
 
 
+@pytest.mark.slow
 def test_the_command_writes_maps_of_the_files_own_size_and_format(tmp_path, here, capsys):
     looks.write("evening.toml", EVENING)
     images.write_exr("a.exr", sky(True), half=True)

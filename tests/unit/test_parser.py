@@ -52,6 +52,7 @@ def test_text_where_a_transform_or_a_number_should_be_is_refused(tmp_path):
         scene.load(write_scene(tmp_path, SENSOR, ball, LIGHT))
 
 
+@pytest.mark.slow
 def test_files_are_looked_for_where_the_scene_says(tmp_path):
     (tmp_path / "assets").mkdir()
     box_obj(tmp_path / "assets" / "box.obj", (1, 1, 1))
@@ -140,6 +141,7 @@ def test_real_meshes_load(data, name, up):
     assert loaded.render(np.ones((8, 16, 3)), spp=4).max() < 1.5
 
 
+@pytest.mark.slow
 def test_digest_follows_what_the_rendering_depends_on(tmp_path):
     mesh = '<shape type="obj"><string name="filename" value="tent.obj"/></shape>'
     tent = tmp_path / "tent.obj"

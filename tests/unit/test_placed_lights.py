@@ -32,6 +32,7 @@ def test_directions_and_angles_are_inverse():
     assert (row, column) == (pytest.approx(45 / 180 * 31), pytest.approx(90 / 360 * 64 - 0.5))
 
 
+@pytest.mark.slow
 def test_nothing_asked_changes_no_bit_and_a_map_is_levelled_as_by_envedit_adjust(sky):
     assert PlacedLights(sky).place([]) is sky
     same = PlacedLights(sky).place([{"light": 1, "flux": [1.0] * 3, "size": 1.0}])

@@ -177,6 +177,7 @@ def stand_in(folder, monkeypatch, script):
     monkeypatch.setattr(sys, "executable", str(folder / "python"))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("own_cache")
 def test_what_is_known_to_be_good_is_not_read_again(tmp_path, monkeypatch):
     python = sys.executable

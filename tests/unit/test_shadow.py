@@ -54,6 +54,7 @@ def test_a_light_that_is_put_there_casts_its_shadow_there(lit):
     assert shown[row, column] < 0.5 * np.median(shown[row]), "the place is in no shadow"
 
 
+@pytest.mark.slow
 def test_where_there_is_no_shadow_the_reason_is_given(lit):
     front = 0.5 * ORIGIN / np.linalg.norm(ORIGIN)
     for place, toward, reason in (

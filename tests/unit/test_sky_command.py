@@ -41,6 +41,7 @@ def test_poles_and_dates_at_the_ends_are_finite():
             assert abs(abs(elevation) - 23.45) < 0.1 and 0 <= azimuth < 360
 
 
+@pytest.mark.slow
 def test_the_sun_of_the_map_is_at_that_azimuth_from_north_and_elevation(tmp_path, capsys):
     out = str(tmp_path / "noon.exr")
     place = ["--place", "47.37", "8.54", "--date", "2026-06-21T17:00+02:00", "--width", "128"]

@@ -107,6 +107,7 @@ def test_one_long_row_does_not_spoil_the_short_ones(rng):
     np.testing.assert_allclose(product(matrix, x), expected, rtol=502 * 2.0**-24)
 
 
+@pytest.mark.slow
 def test_column_indices_survive_as_bits_of_a_float():
     # 0x7f80_0001 upwards would be NaNs; real indices are far below, yet beyond 2^24 a float cannot count.
     index = (1 << 24) + 1

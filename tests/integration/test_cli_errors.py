@@ -16,6 +16,9 @@ from tests.oracles.runs import call, changed, names, pixels, world
 
 pytestmark = pytest.mark.usefixtures("isolated")
 
+PIXELS = {"representation__kind": "pixels"}
+"""What is edited quickest."""
+
 
 @pytest.fixture
 def path(tmp_path, rng):
@@ -90,7 +93,7 @@ def test_a_map_that_is_not_there(path, capsys):
 @pytest.mark.slow
 def test_a_png_as_map_is_taken_with_a_warning(path, capsys, tmp_path, rng):
     images.write_png(tmp_path / "map.png", sky(rng) / 3)
-    assert call(path, "--quiet", *changed(input__envmap="map.png")) == 0
+    assert call(path, "--quiet", *changed(input__envmap="map.png", **PIXELS)) == 0
     out, err = capsys.readouterr()
     (said,) = [line for line in err.splitlines() if "no effect: needs" not in line]
     assert out == "" and said.startswith("envedit: warning: ") and "not HDR" in said
@@ -105,7 +108,7 @@ def test_texels_that_are_not_finite(path, capsys, tmp_path, rng):
     said = fails(3, capsys, path)
     assert "map.exr" in said and "row 3, column 7" in said and "2 texels" in said and "repair" in said
     # What the message asks for works.
-    assert call(path, "--quiet", *changed(input__repair=True)) == 0
+    assert call(path, "--quiet", *changed(input__repair=True, **PIXELS)) == 0
     assert "row 3, column 7" in capsys.readouterr().err
     edited, good = pixels(tmp_path / "c_out" / "edited.exr"), np.ones((8, 16), bool)
     assert np.isfinite(edited).all()

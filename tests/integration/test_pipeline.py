@@ -152,6 +152,7 @@ def test_what_this_view_does_not_determine_changes_less(tmp_path):
     assert found.metrics["render"]["psnr"] > found.metrics["initial"]["psnr"] + 8
 
 
+@pytest.mark.slow
 def test_the_error_that_is_told_is_that_of_the_edited_map(tmp_path, rng, monkeypatch):
     told, predict = [], LightTransport.coarse_error
 
@@ -511,7 +512,7 @@ def test_a_mirror_gets_no_finer_grids_where_coarse_ones_explain_the_target(tmp_p
 def test_an_interrupted_run_of_the_path_tracer_goes_on_where_it_stopped(tmp_path, rng, monkeypatch):
     """Mitsuba adds the gradients of a texel in any order: its runs agree but for the last bits."""
     renderer = {"kind": "path", "spp": 4, "max_depth": 3}
-    settings = settings_of(tmp_path, smooth(rng), renderer=renderer, optimizer={"iterations": 10})
+    settings = settings_of(tmp_path, smooth(rng), renderer=renderer, optimizer={"iterations": 10}, **PIXELS)
     whole = pipeline.run(settings)
     (tmp_path / "run").mkdir()
     with pytest.raises(pipeline.Interrupted):
@@ -600,7 +601,7 @@ def test_a_run_is_resumed_although_mitsuba_renders_the_target_anew(tmp_path, rng
 @pytest.mark.slow
 def test_ctrl_c_is_given_back_after_the_edit(tmp_path, rng):
     before = signal.getsignal(signal.SIGINT)
-    settings = settings_of(tmp_path, sunny(rng), optimizer={"iterations": 1})
+    settings = settings_of(tmp_path, sunny(rng), optimizer={"iterations": 1}, **PIXELS)
     pipeline.run(settings)
     assert signal.getsignal(signal.SIGINT) is before
     with pytest.raises(pipeline.Interrupted):

@@ -26,8 +26,10 @@ def here(tmp_path, monkeypatch):
 
 
 def small():
+    """Return the options of a small and quick edit."""
     keys = {f"{table}__{key}": value for table, keys in TINY.items() for key, value in keys.items()}
-    return changed(**keys | {"scene__width": 16, "optimizer__iterations": 1})
+    quick = {"scene__width": 16, "optimizer__iterations": 1, "representation__kind": "pixels"}
+    return changed(**keys | quick)
 
 
 @pytest.mark.slow

@@ -240,7 +240,7 @@ def test_initial_rendering_and_result_are_judged_with_the_same_samples(kind, spp
 @pytest.mark.slow
 def test_a_result_worse_than_the_input_is_a_warning(tmp_path, rng, monkeypatch, capsys):
     """Also under --quiet."""
-    path = world(tmp_path, rng, optimizer={"iterations": 1})
+    path = world(tmp_path, rng, **PIXELS, optimizer={"iterations": 1})
     compare, scores = pipeline.metrics.compare, iter((20.0, 21.5))
 
     def worse(edited, wanted, *rest):
@@ -257,7 +257,8 @@ def test_a_result_worse_than_the_input_is_a_warning(tmp_path, rng, monkeypatch, 
 def test_paint_that_a_result_is_farther_from_is_a_warning(tmp_path, rng, capsys):
     """Brighter is asked for; what is written is darker, by the exposure of the output."""
     stroke = {"type": "light", "ellipse": [0.45, 0.4, 0.06, 0.06], "amount": 2.0}
-    path = world(tmp_path, rng, target={"kind": "strokes", "strokes": [stroke]}, output={"exposure": -3.0})
+    tables = {"target": {"kind": "strokes", "strokes": [stroke]}, "output": {"exposure": -3.0}}
+    path = world(tmp_path, rng, **PIXELS, **tables)
     assert call(path, "--quiet", "--out", tmp_path / "out") == 0
     said = capsys.readouterr().err
     assert "what was not painted has changed " in said

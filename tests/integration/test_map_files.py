@@ -152,10 +152,9 @@ def test_half_is_cut_at_its_largest_and_says_so(tmp_path, rng):
 @pytest.mark.slow
 def test_a_run_writes_the_format_that_is_asked_for(tmp_path):
     parts = (users_scenes.PATH, users_scenes.SENSOR, BALL, light(2))
-    path, kind = (
-        written(tmp_path, parts, output={"spp": 16, "format": "hdr"}),
-        changed(representation__kind="pixels"),
-    )
+    few = {"target": {"spp": 16}, "renderer": {"spp": 16, "max_depth": 2}}
+    path = written(tmp_path, parts, output={"spp": 16, "format": "hdr"}, **few)
+    kind = changed(representation__kind="pixels")
     assert call(path, "--quiet", "--set", "optimizer.iterations=0", *kind) == 0
     left = content(tmp_path / "c_out")
     assert "edited.hdr" in left and "edited.exr" not in left and b'"edited.hdr"' in left["edited.xml"]

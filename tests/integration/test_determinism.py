@@ -75,14 +75,13 @@ def test_another_seed_gives_other_bytes(renderer, tmp_path, rng, carried_out):
     assert error(one, other) > 1e-4
 
 
-def test_another_process_gives_the_same_files(tmp_path, rng, carried_out):
+def test_another_process_gives_the_same_files(tmp_path, rng):
     """With another order of sets and dicts of strings, and with as many threads as there are cores."""
     path = configured(tmp_path, rng, "layers")
-    here = carried_out(path, 1)
-    for number in ("1", "2"):
-        out = tmp_path / f"process-{number}"
+    first, second = (tmp_path / f"process-{number}" for number in (1, 2))
+    for out, number in ((first, "1"), (second, "2")):
         command = [sys.executable, "-m", "envedit.run", str(path), "--quiet", "--out", str(out)]
         # The second one finds what the first one kept.
         environment = os.environ | {"PYTHONHASHSEED": number, "XDG_CACHE_HOME": str(tmp_path / "shared")}
         subprocess.run(command, cwd=ROOT, env=environment, check=True, timeout=120)
-        assert differing(here, out) == set()
+    assert differing(first, second) == set()

@@ -86,13 +86,29 @@ def found_for(problem, start):
 
 # ---- the sun moves -----------------------------------------------------------------------------------------
 
+ELSEWHERE = (6, 40)
 
-@pytest.mark.parametrize(("row", "column"), [(6, 40), (4, 8)])
-def test_a_shadow_that_was_painted_elsewhere_moves_the_sun(row, column, transport):
+
+def moved(transport, place):
+    """Return the problem of the shadow of a sun that is painted as of another place, and its start."""
+    image = sky(SUN)
+    return problem_of(transport, image, *painted(transport, image, sky(place)))
+
+
+@pytest.fixture(scope="module")
+def moved_elsewhere(traced):
+    problem, start = moved(traced(), ELSEWHERE)
+    return problem, *found_for(problem, start)
+
+
+@pytest.mark.parametrize("place", [ELSEWHERE, (4, 8)])
+def test_a_shadow_that_was_painted_elsewhere_moves_the_sun(place, transport, moved_elsewhere):
     """To within 5 degrees, less than a texel; one sun, with the flux that it had."""
-    image, place = sky(SUN), (row, column)
-    problem, start = problem_of(transport, image, *painted(transport, image, sky(place)))
-    found, lights, before, tried = found_for(problem, start)
+    if place == ELSEWHERE:
+        problem, found, lights, before, tried = moved_elsewhere
+    else:
+        problem, start = moved(transport, place)
+        found, lights, before, tried = found_for(problem, start)
     assert [*lights] == [0] and angle(lights[0], DIRECTIONS[place]) < 5
     assert found.name == "light 1 moved" and tried >= 1
     assert found.score < before - search.POSITIVE_EVIDENCE
@@ -103,7 +119,7 @@ def test_a_shadow_that_was_painted_elsewhere_moves_the_sun(row, column, transpor
 
 def test_the_new_shadow_alone_says_so_too(transport):
     """Of the old one nothing was painted: the rest may follow."""
-    image, place = sky(SUN), (6, 40)
+    image, place = sky(SUN), ELSEWHERE
     before, after = (rendered(transport, one) for one in (image, sky(place)))
     darker = (after.mean(axis=2, keepdims=True) < 0.75 * before.mean(axis=2, keepdims=True)).astype("f4")
     picture = np.where(darker > 0, after, before)
@@ -219,19 +235,15 @@ def test_paint_that_one_factor_makes_leaves_lights(factor, transport):
 
 def test_a_map_that_is_not_finite_has_no_explanation(transport):
     """The search returns it as it is; the steps refuse it."""
-    image = sky(SUN)
-    problem, start = problem_of(transport, image, *painted(transport, image, sky((6, 40))))
+    problem, start = moved(transport, ELSEWHERE)
     start["flux"][0] = np.nan
     found = search.search(problem, start)
     assert found.point.residual is None and found.score == np.inf
 
 
-def test_the_same_paint_has_the_same_explanation_to_the_bit(traced):
-    image = sky(SUN)
-    ends = []
-    for transport in (traced(), traced()):
-        problem, start = problem_of(transport, image, *painted(transport, image, sky((6, 40))))
-        ends.append(search.search(problem, start))
-    assert ends[0].score == ends[1].score and ends[0].name == ends[1].name
-    for name, value in ends[0].run.state.items():
-        assert value.tobytes() == ends[1].run.state[name].tobytes(), name
+def test_the_same_paint_has_the_same_explanation_to_the_bit(transport, moved_elsewhere):
+    found = moved_elsewhere[1]
+    again, *_ = found_for(*moved(transport, ELSEWHERE))
+    assert again.score == found.score and again.name == found.name
+    for name, value in found.run.state.items():
+        assert value.tobytes() == again.run.state[name].tobytes(), name

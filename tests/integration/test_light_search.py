@@ -108,9 +108,6 @@ def test_the_map_that_is_found_gives_the_picture(transport, moved):
     assert np.square(after - wanted).mean() < 0.1**2 * np.square(before - wanted).mean()
 
 
-# ---- lights that stay, go and come -----------------------------------------------------------------------
-
-
 # ---- pictures that say little ----------------------------------------------------------------------------
 
 

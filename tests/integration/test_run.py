@@ -338,19 +338,14 @@ def test_earlier_results_are_moved_and_never_lost(tmp_path, rng):
 
 
 @pytest.mark.slow
-def test_the_written_configuration_runs_again_in_its_own_folder(tmp_path, rng):
+def test_the_written_configuration_runs_again_in_its_own_folder(tmp_path, rng, monkeypatch):
+    """To the same map, with what was there moved away; and where a run of it has failed."""
     path, out = world(tmp_path, rng, **PIXELS), tmp_path / "c_out"
     assert call(path, "--quiet") == 0
     first = pixels(out / "edited.exr")
     assert call(out / "config.toml", "--quiet") == 0
     assert pixels(out / "edited.exr").tobytes() == first.tobytes()
     assert names(out / "earlier-1") == FILES | INFLUENCE
-
-
-@pytest.mark.slow
-def test_the_configuration_stays_where_a_run_that_fails_finds_it_again(tmp_path, rng, monkeypatch):
-    path, out = world(tmp_path, rng, **PIXELS), tmp_path / "c_out"
-    assert call(path, "--quiet") == 0
     with monkeypatch.context() as patch:
         patch.setattr(pipeline, "run", lambda *_, **__: (_ for _ in ()).throw(KeyboardInterrupt))
         assert call(out / "config.toml", "--quiet") == 130

@@ -103,6 +103,7 @@ def test_a_map_is_unclipped_at_file_size_when_it_is_read(tmp_path):
     assert read.unclipped.startswith("sun of flux")
 
 
+@pytest.mark.slow
 def test_cloud_and_lamp_are_named_and_left_alone(tmp_path, capsys):
     room = np.full((WIDTH // 2, WIDTH, 3), 0.01, np.float32)
     room[60:80, 100:130] = 50
@@ -122,6 +123,7 @@ def test_a_black_map_and_one_bright_texel_are_no_sun(shape, tmp_path, capsys):
     assert not json.loads(capsys.readouterr().out)["added"]
 
 
+@pytest.mark.slow
 def test_the_ratio_to_the_sky_and_the_flux_are_as_asked(tmp_path, capsys):
     image, _ = sun(clip=30.0)
     cosine = np.maximum(DIRECTIONS[..., 1:2], 0)

@@ -1,8 +1,9 @@
 """How much of what was painted lights explain: those of the map, and one more anywhere in its sky.
 
-Unknown are factors, one a channel: of each light of the map, of all the rest of it, and of another light. No
-prior holds them; the mean of what was not painted changes by little more than what is visible. The light is
-tried in each cell of the block transport (5.6 degrees), then in each texel around the best cell.
+Unknown are factors, one a channel: of each light of the map, of all the rest of it, which changes by no more
+than photographed skies do, and of another light. The mean of what was not painted changes by little more than
+what is visible. The light is tried in each cell of the block transport (5.6 degrees), then in each texel
+around the best cell.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from envedit.core.color import tonemap
 from envedit.losses import display_curve
 from envedit.representations.layers.separation import separate
 from envedit.solve.likelihood import STATEMENTS, Likelihood
+from envedit.solve.prior import PHOTOGRAPHED
 from envedit.targets.pixel_weights import FOLLOWING
 from experiments.painted_edits.painters import Paint, View
 
@@ -28,8 +30,10 @@ FIRST_SHARE = 0.1
 """Light that is added at first, over the light in the picture."""
 STARTS = 0.0, -5.0
 """Log factors that the map's lights have at first: as they are, and out."""
-LOG_FACTORS = -8.0, 8.0
-"""Bounds of the log factors."""
+SKY_LOG_FACTOR = 2 * PHOTOGRAPHED[0].whole
+"""Largest log factor of all the map but its lights: two standard deviations between photographed skies."""
+LIGHT_LOG_FACTOR = 8.0
+"""Largest log factor of a light."""
 NEAR_COSINE = np.cos(np.radians(6.0))
 """Cosine of the angle from a cell within which texels are tried."""
 
@@ -134,6 +138,8 @@ class _Comparison:
         shown = self._display(self.aim[None, :, c])
         x = np.zeros(parts.shape[:2])
         x[:, 1:-1] = start
+        largest = np.full(parts.shape[1], LIGHT_LOG_FACTOR)
+        largest[0] = SKY_LOG_FACTOR
         damping = np.full(len(lit), 1e-2)
         radiance = _radiance(x, parts, self.other[:, c])
         misfit = self._misfit(self._display(radiance) - shown)
@@ -142,7 +148,7 @@ class _Comparison:
             diagonal = np.einsum("kii->ki", hessian)
             diagonal += damping[:, None] * diagonal + 1e-9
             step = np.linalg.solve(hessian, -gradient[..., None])[..., 0]
-            tried = np.clip(x + np.clip(step, -LARGEST_STEP, LARGEST_STEP), *LOG_FACTORS)
+            tried = np.clip(x + np.clip(step, -LARGEST_STEP, LARGEST_STEP), -largest, largest)
             there = _radiance(tried, parts, self.other[:, c])
             then = self._misfit(self._display(there) - shown)
             better = then < misfit

@@ -68,7 +68,7 @@ def light(codes: np.ndarray, info: Info) -> np.ndarray:
     """Return the linear radiance (H, W, 3) float32 of sRGB codes (H, W, C); what is transparent is dark."""
     top = np.iinfo(codes.dtype).max
     warnings = info["warnings"]
-    warnings.append(f"a {info['bits']}-bit {info['format'].upper()} is not HDR: light above 1 is missing")
+    warnings.append(f"{info['format'].upper()} of {info['bits']} bits is not HDR: light above 1 is missing")
     colours = 3 if codes.shape[2] >= 3 else 1
     values = srgb_to_linear(np.arange(top + 1) / top).astype(np.float32)
     radiance = values[np.broadcast_to(codes[..., :colours], (*codes.shape[:2], 3))]

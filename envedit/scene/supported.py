@@ -74,7 +74,7 @@ def own_map(
         if where.lower().endswith(shipped.USD_ENDINGS):
             emitter = "a DomeLight"
         missing = f"{where}: no environment emitter: add {emitter}, {_GIVE_MAP}"
-        note = "no environment emitter: the map lights the scene beside its own lamps"
+        note = "no environment emitter: the map lights the scene beside any lamps of its own"
         return OwnMap(None, factor, (note,), missing=missing, added=True)
     props = state.nodes[index].props
     if props.plugin_name() == "constant" and props.id() == PLACEHOLDER:

@@ -137,8 +137,8 @@ EXPERIMENT = Experiment(
         STATISTICS
         | {
             "lights explain": "{one_light.mean:.0%}",
-            "at least 75 % of them towards the paint, of those that lights explain so far": (
-                "{of_explained.above[0.75]} of {of_explained.count}"
+            "at least 75 %: explained, reached of these": (
+                "{of_explained.count}, {of_explained.above[0.75]}"
             ),
             "sun off, degrees, at most": "{sun_off.max:.1f}",
         },

@@ -133,9 +133,9 @@ def stated_origin(file: FilePath, info: Info, expected: Mapping[str, object]) ->
     """Return what a painted picture was exported with, as its metadata or a file beside it says.
 
     The file beside it is the one with its name, where it was saved over the export; otherwise, of those in
-    its folder that are of the same scene, one that agrees with this run, or else the first. ``info`` is of
-    :func:`envedit.images.images.read_stored`, ``expected`` what an export of this run says. What is returned
-    is as :func:`origin`, values as text; empty where nothing is said.
+    its folder that are of the same scene, the one that differs from this run in the fewest values. ``info``
+    is of :func:`envedit.images.images.read_stored`, ``expected`` what an export of this run says. What is
+    returned is as :func:`origin`, values as text; empty where nothing is said.
 
     InputError if a value of :data:`KEYS` is not that of this run: the rendering is not the one that was
     painted on.
@@ -176,6 +176,12 @@ def _beside(file, expected):
             stated[path] = {str(key): str(value) for key, value in facts.items()}
     if not stated:
         return {}, None
-    agreeing = [path for path, facts in stated.items() if not _differing(facts, expected)]
-    chosen = own if own in stated else (agreeing or list(stated))[0]
+
+    def unlike(path):
+        """Values that make it another rendering come before those of its map's name and tonemap."""
+        facts = stated[path]
+        others = [key for key, value in facts.items() if value != str(expected.get(key))]
+        return len(_differing(facts, expected)), len(others)
+
+    chosen = own if own in stated else min(stated, key=unlike)
     return stated[chosen], chosen

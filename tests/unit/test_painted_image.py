@@ -640,6 +640,16 @@ def test_a_neighbour_of_another_scene_says_nothing(initial, tmp_path):
     assert painted_image.read(file, SIZE, "auto", initial, exported=here).coverage.any()
 
 
+def test_of_exports_under_several_maps_that_of_the_run_s_map_counts(initial, tmp_path):
+    for name, curve in (("a_grey", "gamma"), ("noon", "reinhard"), ("z_grey", "gamma")):
+        made = config.Config(input={"envmap": f"{name}.exr"})
+        initial_rendering.export(tmp_path / f"{name}.png", initial, made, curve)
+    file = png(tmp_path / "painted.png", codes(brushed(initial)[0], "reinhard"))
+    here = exported("reinhard", input={"envmap": "noon.exr"})
+    found = painted_image.read(file, SIZE, "reinhard", initial, exported=here)
+    np.testing.assert_array_equal(found.coverage[..., 0] > 0, brushed(initial)[1])
+
+
 def test_texts_of_a_png_are_as_another_program_reads_them(tmp_path, rng):
     picture = rng.random((5, 7, 3))
     named = {"envedit.tonemap": "gamma", "envedit.envmap": "fjälls 空.hdr"}

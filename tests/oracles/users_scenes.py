@@ -215,12 +215,12 @@ def installed() -> set[str]:
 HEAD = """\
 # Scenes
 
-What happens with scenes of each kind, and with each plugin of Mitsuba 3.9. Tests check both tables
+What happens with scenes of each kind, and with each plugin of Mitsuba 3.9
 (`python -m tests.oracles.users_scenes > docs/scenes.md` writes the page).
 
 - **The map.** Without `--envmap` (`[input] envmap`), or with `envmap = "scene"`, the scene's environment
   emitter is edited: the file of an `envmap`, or a map that `constant`, `sunsky` and `timed_sunsky` are
-  rendered to. With `--envmap`, the map takes its place or lights a scene without one. Without it, shipped
+  rendered to. With `--envmap`, the map takes its place, or lights a scene without one. Without it, shipped
   scenes are lit by an analytic sky.
 - **Orientation and scale.** The `to_world` and `scale` of an `envmap` apply to any map; `[scene] scale`
   replaces the scale, which is not in `edited.exr`. The zenith of `sunsky` is +z; for `constant`, and without
@@ -229,7 +229,7 @@ What happens with scenes of each kind, and with each plugin of Mitsuba 3.9. Test
 - **Several views.** `[scene] sensors = "all"`, or a list by `id` or by index from 0, makes every one a
   picture; without it the first is used. They need the same width, and not `renderer.kind = "path"`.
 - **Variants.** `llvm_ad_rgb` and, on an NVIDIA GPU, `cuda_ad_rgb`; `metal_ad_rgb` was not tried. Spectra are
-  converted to RGB. Spectral and polarised rendering are not supported.
+  converted to RGB.
 
 [This experiment](../experiments/scenes/README.md) loads, renders and edits every Mitsuba scene of a folder.
 """

@@ -1,11 +1,11 @@
 """Convolution with ReLU, max pooling and Hanning pooling, forward and back, natively in Dr.Jit.
 
 Activations are flat arrays, channels together: a pixel a row of (H * W, C), as Dr.Jit multiplies tall
-matrices fastest (``docs/engine.md``). A convolution gathers the patches under its kernel into a matrix
-(pixels, taps * channels) and multiplies by the weights; its reverse multiplies by the weights again
-and lets every input pixel gather what the windows over it hold. So nothing is added with atomics,
-NaN is not lost, and the same run gives the same bits. Large images go through in bands of rows, so
-that the matrix of patches stays below :data:`MOST_PATCHES`.
+matrices fastest (``docs/decisions/network_layout.md``). A convolution gathers the patches under its kernel
+into a matrix (pixels, taps * channels) and multiplies by the weights; its reverse multiplies by the weights
+again and lets every input pixel gather what the windows over it hold. So nothing is added with atomics, NaN
+is not lost, and the same run gives the same bits. Large images go through in bands of rows, so that the
+matrix of patches stays below :data:`MOST_PATCHES`.
 
 Kernels take sizes as data: one kernel serves all layers and all image sizes. Divisions by sizes, which
 processors do slowly, are products with their inverses in double precision (:class:`Divisor`).

@@ -88,7 +88,8 @@ def unpolished(settings: config.Fit) -> config.Fit:
     """Return a recipe that perturbs to the end and leaves the last layer as it was trained.
 
     A polished fit has the map's sun, sharp and bright; a robust one is vague about it. To move a sun that is
-    not there yet is easier: edits of sunny maps that start from a robust fit end better (docs/siren.md).
+    not there yet is easier: edits of sunny maps that start from a robust fit end better
+    (``docs/decisions/fit_of_the_network.md``).
     """
     return replace(settings, awp_until=1.0, light=0.0)
 

@@ -114,12 +114,12 @@ class Perceptual(Table):
     """Trained weights, as `envedit weights` fetches them; without them DISTS is off and LPIPS null."""
 
     weights: str = key("", String(), "folder of the files; empty: where `envedit weights` puts them")
-    vgg: str = key("", String(), "DISTS: file of VGG16 (safetensors, npz; torchvision's names)", when=_DISTS)
-    dists: str = key("", String(), "DISTS: file of its alpha and beta (safetensors or npz)", when=_DISTS)
+    vgg: str = key("", String(), "DISTS: file of VGG16 (npz, torchvision's names)", when=_DISTS)
+    dists: str = key("", String(), "DISTS: file of its alpha and beta (npz)", when=_DISTS)
     dists_every: int = key(4, Integer(1, 1000), "DISTS: steps from one evaluation to the next", when=_DISTS)
-    network: str = key("alex", Choice("alex", "vgg", "squeeze"), "LPIPS: its network")
-    backbone: str = key("", String(), "LPIPS: file of that network (safetensors or npz)")
-    heads: str = key("", String(), "LPIPS: file of its heads, version 0.1 (safetensors or npz)")
+    network: str = key("alex", Choice("alex", "vgg"), "LPIPS: its network")
+    backbone: str = key("", String(), "LPIPS: file of that network (npz)")
+    heads: str = key("", String(), "LPIPS: file of its heads, version 0.1 (npz)")
 
     def _check_together(self) -> None:
         for one, other in (("vgg", "dists"), ("backbone", "heads")):

@@ -3,7 +3,6 @@
 import functools
 import io
 import itertools
-import json
 import struct
 import tempfile
 import zlib
@@ -218,22 +217,12 @@ def tensors() -> dict[str, np.ndarray]:
 
 
 def weight_files() -> dict[str, bytes]:
-    """Make files of weights: npz stored and compressed, safetensors of three precisions."""
+    """Make files of weights: npz stored and compressed."""
     files = {}
     for save in (np.savez, np.savez_compressed):
         stream = io.BytesIO()
         save(stream, **tensors(), more=np.arange(3))
         files[f"{save.__name__}.npz"] = stream.getvalue()
-    for kind, dtype in (("F16", "<f2"), ("F32", "<f4"), ("F64", "<f8")):
-        entries = {"__metadata__": {"format": "pt"}}
-        data = b""
-        for name, values in tensors().items():
-            start = len(data)
-            data += values.astype(dtype).tobytes()
-            place = [start, len(data)]
-            entries[name] = {"dtype": kind, "shape": list(values.shape), "data_offsets": place}
-        text = json.dumps(entries).encode()
-        files[f"{kind}.safetensors"] = struct.pack("<Q", len(text)) + text + data
     return files
 
 

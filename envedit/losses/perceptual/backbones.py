@@ -1,4 +1,4 @@
-"""Feature stacks of VGG16, AlexNet and SqueezeNet 1.1 as torchvision has them, on `convolution`."""
+"""Feature stacks of VGG16 and AlexNet as torchvision has them, on `convolution`."""
 
 from __future__ import annotations
 
@@ -20,37 +20,28 @@ from envedit.losses.perceptual import convolution, weights
 
 @dataclass(frozen=True)
 class Conv:
-    """A convolution and its ReLU; several names are convolutions of one input whose outputs lie side by side.
+    """A convolution and its ReLU."""
 
-    Those of a smaller kernel stand in the middle of the larger one, among zeros.
-    """
-
-    names: tuple[str, ...]
+    name: str
     inputs: int
     outputs: int
     kernel: int
     stride: int = 1
     padding: int = 0
-    kernels: tuple[int, ...] = ()
     tap: bool = False
 
     def parts(self) -> dict[str, tuple[int, ...]]:
         """Name the tensors of the layer, with their shapes in torchvision's layout (O, I, kh, kw)."""
-        outputs = self.outputs // len(self.names)
-        shapes: dict[str, tuple[int, ...]] = {}
-        for name, k in zip(self.names, self.kernels or (self.kernel,), strict=True):
-            shapes[name + ".weight"] = outputs, self.inputs, k, k
-            shapes[name + ".bias"] = (outputs,)
-        return shapes
+        weight = self.outputs, self.inputs, self.kernel, self.kernel
+        return {f"{self.name}.weight": weight, f"{self.name}.bias": (self.outputs,)}
 
 
 @dataclass(frozen=True)
 class Pool:
-    """Max pooling; with ``ceil`` a last window may reach over the edge of the image."""
+    """Max pooling."""
 
     kernel: int
     stride: int = 2
-    ceil: bool = False
 
 
 def _vgg16():
@@ -61,7 +52,7 @@ def _vgg16():
             layers.append(Pool(2))
             index += 1
         for i in range(count):
-            layers.append(Conv((f"features.{index}",), channels, width, 3, padding=1, tap=i == count - 1))
+            layers.append(Conv(f"features.{index}", channels, width, 3, padding=1, tap=i == count - 1))
             channels = width
             index = index + 2
     return layers
@@ -70,30 +61,13 @@ def _vgg16():
 def _alexnet():
     sizes = [(0, 3, 64, 11, 4, 2), (3, 64, 192, 5, 1, 2), (6, 192, 384, 3, 1, 1)]
     sizes += [(8, 384, 256, 3, 1, 1), (10, 256, 256, 3, 1, 1)]
-    convs = [Conv((f"features.{i}",), a, b, k, s, p, tap=True) for i, a, b, k, s, p in sizes]
+    convs = [Conv(f"features.{i}", a, b, k, s, p, tap=True) for i, a, b, k, s, p in sizes]
     return [convs[0], Pool(3), convs[1], Pool(3), *convs[2:]]
-
-
-def _squeezenet():
-    def fire(index, inputs, inner, outputs, tap=True):
-        at = f"features.{index}."
-        expand = Conv((at + "expand1x1", at + "expand3x3"), inner, outputs, 3, 1, 1, (1, 3), tap)
-        return [Conv((at + "squeeze",), inputs, inner, 1), expand]
-
-    pool = Pool(3, ceil=True)
-    return [
-        Conv(("features.0",), 3, 64, 3, 2, tap=True),
-        *(pool, *fire(3, 64, 16, 128, tap=False), *fire(4, 128, 16, 128)),
-        *(pool, *fire(6, 128, 32, 256, tap=False), *fire(7, 256, 32, 256)),
-        *(pool, *fire(9, 256, 48, 384), *fire(10, 384, 48, 384)),
-        *(*fire(11, 384, 64, 512), *fire(12, 512, 64, 512)),
-    ]
 
 
 KINDS = {
     "vgg": ("VGG16", _vgg16, "vgg16", "vgg16-397923af.pth"),
     "alex": ("AlexNet", _alexnet, "alexnet", "alexnet-owt-7be5be79.pth"),
-    "squeeze": ("SqueezeNet 1.1", _squeezenet, "squeezenet1_1", "squeezenet1_1-b8a52dc0.pth"),
 }
 """Name as LPIPS has it -> title, layers, torchvision's name, torchvision's file."""
 
@@ -103,7 +77,7 @@ class Backbone:
 
     .. code-block:: python
 
-       backbone = Backbone.load("vgg", "vgg16.safetensors")
+       backbone = Backbone.load("vgg", "vgg16.npz")
        stack = backbone.stack(64, 256)
        tape = stack.forward(x)              # flat, 64 * 256 * 3 numbers, normalised as the network requires
        taps = stack.taps(tape)              # [(flat array of N * C numbers, N, C), ...]
@@ -123,7 +97,7 @@ class Backbone:
 
     @classmethod
     def load(cls, kind: str, file: FilePath) -> Backbone:
-        """Read the weights from a ``safetensors`` or ``npz`` file that holds torchvision's state dict.
+        """Read the weights from an ``npz`` file that holds torchvision's state dict.
 
         Further tensors, such as those of the classifier, are ignored; errors as of :func:`.weights.read`.
         """
@@ -165,21 +139,14 @@ def _size_after(layer, n, pooling):
         return max((n + 2 * layer.padding - layer.kernel) // layer.stride + 1, 0)
     if pooling == "hanning":
         return (n - 1) // 2 + 1
-    reach = n - layer.kernel + (layer.stride - 1 if layer.ceil else 0)
-    return max(reach // layer.stride + 1, 0)
+    return max((n - layer.kernel) // layer.stride + 1, 0)
 
 
 def _as_matrix(layer, tensors):
     """Weights (O, taps * I), channels together as in an image, and bias (O,), in memory."""
-    blocks = []
-    for name in layer.names:
-        block = tensors[name + ".weight"]
-        margin = (layer.kernel - block.shape[2]) // 2
-        block = np.pad(block, ((0, 0), (0, 0), (margin, margin), (margin, margin)))
-        blocks.append(block.transpose(0, 2, 3, 1).reshape(len(block), -1))
-    matrix = np.ascontiguousarray(np.concatenate(blocks), np.float32)
-    bias = np.concatenate([tensors[name + ".bias"] for name in layer.names]).astype(np.float32)
-    return tensor(matrix), dr.opaque(mi.Float(bias))
+    kernels = tensors[f"{layer.name}.weight"]
+    matrix = kernels.transpose(0, 2, 3, 1).reshape(len(kernels), -1)
+    return tensor(matrix), dr.opaque(mi.Float(tensors[f"{layer.name}.bias"]))
 
 
 # ---- A network laid out for one size of image --------------------------------------------------------------

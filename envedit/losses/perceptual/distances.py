@@ -95,8 +95,8 @@ class Dists:
     ``alpha (mu_x - mu_y)^2 / (mu_x^2 + mu_y^2 + c1) + beta var_(x - y) / (var_x + var_y + c2)``.
     Any image of at least one pixel will do.
 
-    The backbone is VGG16, the weights' file ``safetensors`` or ``npz`` with ``alpha`` and ``beta``, each
-    (1, 1475, 1, 1); errors as of :func:`.weights.read`.
+    The backbone is VGG16, the weights' file an ``npz`` with ``alpha`` and ``beta``, each (1, 1475, 1, 1);
+    errors as of :func:`.weights.read`.
     """
 
     def __init__(self, backbone: Backbone, weights_file: FilePath):
@@ -213,7 +213,7 @@ class Lpips:
 
     .. code-block:: python
 
-       lpips = Lpips("alex", "alexnet.safetensors", "lpips_v0.1_alex.npz")
+       lpips = Lpips("alex", "alexnet.npz", "lpips_v0.1_alex.npz")
        lpips(a, b)                                # a float
 
     Zhang et al. 2018 ("The unreasonable effectiveness of deep features as a perceptual metric",
@@ -221,9 +221,9 @@ class Lpips:
     their length at each pixel; squared differences, weighted by channel, averaged over pixels, summed
     over layers. Images in [0, 1] are mapped to [-1, 1] first, which is the authors' ``normalize=True``.
 
-    ``kind`` is "alex", "vgg" or "squeeze", ``backbone`` the network or its file (`Backbone.load`), the heads'
-    file ``safetensors`` or ``npz`` with ``lin0.model.1.weight`` (1, C, 1, 1) and so on, one for every layer;
-    errors as of :func:`.weights.read`.
+    ``kind`` is "alex" or "vgg", ``backbone`` the network or its file (`Backbone.load`), the heads' file an
+    ``npz`` with ``lin0.model.1.weight`` (1, C, 1, 1) and so on, one for every layer; errors as of
+    :func:`.weights.read`.
     """
 
     def __init__(self, kind: str, backbone: FilePath | Backbone, heads_file: FilePath):

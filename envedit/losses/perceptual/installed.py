@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from envedit.losses.perceptual.distances import Dists, Lpips
 
 VGG, DISTS = "vgg16_features.npz", "dists_alpha_beta.npz"
-BACKBONES = {"alex": "alexnet_features.npz", "vgg": VGG, "squeeze": "squeezenet_features.npz"}
+BACKBONES = {"alex": "alexnet_features.npz", "vgg": VGG}
 HEADS = "lpips_v0.1_{}.npz"
 """Names of the files in a folder of weights."""
 

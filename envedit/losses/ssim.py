@@ -214,10 +214,6 @@ class KnownGradient(dr.CustomOp):
         value, self.gradient = measure._evaluate(dr.detach(x), True)
         return value
 
-    def forward(self) -> None:
-        """Multiply the tangent by the gradient and add up."""
-        self.set_grad_out(dr.sum(self.gradient * self.grad_in("x")))
-
     def backward(self) -> None:
         """Scale the gradient by the loss's."""
         self.set_grad_in("x", self.gradient * self.grad_out())

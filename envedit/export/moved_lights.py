@@ -14,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from envedit.core import latlong
-from envedit.core.arrays import flat
+from envedit.core.arrays import flat, vectors
 from envedit.core.rotations import rotated
 from envedit.export.texel_maps import Band, Places
 from envedit.representations.layers import lights
@@ -79,17 +79,17 @@ class MovedLights:
         factor = float(lights.size_factor(self.size[light, 0]))
         half_row = max(1.0, factor)
         flux = flux * lights.flux_factor(self.flux[light])
-        point = _columns(mi.Vector3f, lights.points(row, column, self.height, self.width))
+        point = vectors(mi.Vector3f, lights.points(row, column, self.height, self.width))
         size = dr.opaque(mi.Float, factor)
-        centre = _opaque(mi.Vector3f, self.layers.lights.centres[light])
-        turn = _opaque(mi.Vector3f, self.turn[light])
+        centre = vectors(mi.Vector3f, self.layers.lights.centres[light])
+        turn = vectors(mi.Vector3f, self.turn[light])
         sine = flat(mi.Float, np.sin(np.pi * row / max(self.height - 1, 1)).astype(np.float32)) * size
         places = lights.placed(point, centre, turn, size, sine, (self.height, self.width))
         dr.eval(places)
         reach = places[0].numpy()
         first, last = int(np.floor(reach.min() - half_row)), int(np.ceil(reach.max() + half_row))
         omega = mi.Color3f(flat(mi.Float, (omega * factor**2).astype(np.float32)))
-        flux = _columns(mi.Color3f, flux)
+        flux = vectors(mi.Color3f, flux)
         self.points.append(_Points(int(light), places, flux, omega, half_row, first, last))
 
     def place_lobe(self, light: int) -> None:
@@ -110,7 +110,7 @@ class MovedLights:
             total += omega[row] * float(_lobe(angle, np).sum())
 
         flux = own.flux[light] * lights.flux_factor(self.flux[light])
-        self.lobes.append((_opaque(mi.Vector3f, centre), radius, _opaque(mi.Color3f, flux / total)))
+        self.lobes.append((vectors(mi.Vector3f, centre), radius, vectors(mi.Color3f, flux / total)))
 
     def lobes_at(self, d: mi.Vector3f) -> Iterator[mi.Color3f]:
         """Yield the radiance of each light that was added, at directions."""
@@ -156,12 +156,3 @@ def _lobe(angle, library):
     """Return a Gaussian of an angle in radii, in numpy or in Dr.Jit."""
     where = np.where if library is np else dr.select
     return where(angle < REACH, library.exp(-0.5 * library.square(angle)), 0)
-
-
-def _columns(kind, values):
-    """Copy the columns of (n, 3) to a vector or a colour."""
-    return kind(*(flat(mi.Float, column) for column in values.T.astype(np.float32)))
-
-
-def _opaque(kind, values):
-    return dr.opaque(kind(*(float(v) for v in values)))

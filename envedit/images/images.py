@@ -157,7 +157,11 @@ def _check_shape(image, info):
     name = info["path"]
     rows, columns = image.shape[:2]
     if abs(columns - 2 * rows) > 1:
-        raise InputError(f"{name}: a lat-long map is 2:1, this is {columns} x {rows}{_remedy(image, info)}")
+        remedy = "; crop it, or convert it to lat-long"
+        if "data_size" in info:
+            width, height = info["data_size"]
+            remedy = f", its display window, and its data window {width} x {height}; save the two alike, 2:1"
+        raise InputError(f"{name}: a lat-long map is 2:1, this is {columns} x {rows}{remedy}")
     if rows < latlong.MIN_HEIGHT:
         raise InputError(f"{name}: {columns} x {rows} texels are too few for a map; use at least 6 x 3")
     if columns != 2 * rows:
@@ -208,25 +212,6 @@ def _note_oddities(stored, image, info):
         )
     if not image.any():
         warnings.append("the map is black: it lights nothing")
-
-
-_SHAPES = {
-    1 / 6: "a cube map in a column", 6: "a cube map in a row", 3 / 4: "a cube map as a vertical cross",
-    4 / 3: "a cube map as a horizontal cross", 1: "a mirror ball, an angular map or a fisheye",
-}  # fmt: skip
-"""What else maps are, by width over height."""
-
-
-def _remedy(image, info):
-    """Say, from its size, what an image is that is not 2:1, and what to do."""
-    rows, columns = image.shape[:2]
-    if "data_size" in info:
-        width, height = info["data_size"]
-        return f", its display window, and its data window {width} x {height}; save the two alike, 2:1"
-    if columns == 4 * rows:
-        return ", the shape of half a sphere; add the rows of the other half"
-    kind = _SHAPES.get(columns / rows)
-    return f", the shape of {kind}; convert it to lat-long" if kind else "; crop or resize it"
 
 
 def _of_array(values: np.ndarray, name: str, space: str) -> tuple[np.ndarray, dict]:

@@ -47,7 +47,7 @@ def illuminating(scene: Scene, view: int, x: float, y: float) -> np.ndarray:
     It maximises cos(angle to the normal) times the share of directions within :data:`CLEARANCE_DEGREES` in
     which no object stands: the shading normal, where nothing is in the way.
 
-    Place and direction are as of the module. NoPlaceError if no surface is seen there, it only reflects as a
+    NoPlaceError if no surface is seen there, it only reflects as a
     mirror, or no part of the map is seen from it.
     """
     surface, normal, _ = _surface_at(scene, view, x, y)
@@ -69,7 +69,7 @@ def rimming(scene: Scene, view: int, x: float, y: float) -> np.ndarray:
     tangent plane: what lies between the place and the silhouette faces the light. It is the direction closest
     to that behind the place with no object within :data:`CLEARANCE_DEGREES`, such as a floor.
 
-    Place and direction are as of the module. NoPlaceError if no surface is seen there, it faces the camera,
+    NoPlaceError if no surface is seen there, it faces the camera,
     or objects are in the way.
     """
     surface, normal, eye = _surface_at(scene, view, x, y)
@@ -93,7 +93,7 @@ def shading(scene: Scene, view: int, x: float, y: float, light: np.ndarray | Non
     where nothing fills all, it is the one closest to ``light`` (3,), where the light stands in the frame of
     the map; without it the one closest to the normal.
 
-    Place and direction are as of the module. NoPlaceError if no surface is seen there, or no object stands
+    NoPlaceError if no surface is seen there, or no object stands
     above it.
     """
     surface, normal, _ = _surface_at(scene, view, x, y, smooth=False)  # facets do not shade one another
@@ -117,7 +117,7 @@ def highlighting(scene: Scene, view: int, x: float, y: float) -> np.ndarray:
     specular surfaces alone the light itself. The result is the mean of the directions that show at least
     half as much as the best one.
 
-    Place and direction are as of the module. NoPlaceError if what is seen there is not glossy, or reflects
+    NoPlaceError if what is seen there is not glossy, or reflects
     mostly another object.
     """
     value, specular, bounces, leaves, toward = _followed(scene, view, x, y)

@@ -175,32 +175,13 @@ class Scene:
     ) -> np.ndarray:
         """Render the scene under a map by Mitsuba's ``path`` integrator, with fresh samples.
 
-        The samples are split into passes of at most 2^22, each with its own seed derived from ``seed``, and
-        averaged in float64.
+        ``image`` (H, W, 3) is linear radiance, as the returned rendering (height, width, 3) float32. There
+        are ``spp`` samples a pixel, in passes of at most 2^22 samples, which are averaged in float64; the
+        same ``seed`` gives the same ones. ``max_depth`` is the longest path in segments, as Mitsuba counts
+        them: 2 is direct light; -1 has no bound. None: the scene's own.
 
-        Parameters
-        ----------
-        image : array (H, W, 3)
-            Linear radiance.
-        spp : int
-            Samples per pixel.
-        seed : int
-            The same seed gives the same samples.
-        max_depth : int, optional
-            Longest path in segments, as Mitsuba counts them: 2 is direct light; -1 has no bound. None: the
-            scene's own.
-
-        Returns
-        -------
-        array (height, width, 3) float32
-            Linear radiance.
-
-        Raises
-        ------
-        ConfigError
-            If ``spp``, ``seed`` or ``max_depth`` is out of range.
-        InputError, NumericalError
-            As :meth:`set_envmap`; also NumericalError if a pixel comes out non-finite.
+        ConfigError if ``spp``, ``seed`` or ``max_depth`` is out of range. InputError and NumericalError as of
+        :meth:`set_envmap`; also NumericalError if a pixel comes out non-finite.
         """
         spp = _whole("spp", spp, 1)
         seed = _whole("seed", seed, 0)
@@ -220,24 +201,12 @@ class Scene:
 
         Passes of 64 samples a pixel are added until the error of their mean, estimated from how much their
         display values clip(x, 0, 1)^(1/2.2) differ, is :data:`QUIET_DECIBELS` below white: 256 samples at
-        least, 768 at most.
+        least, 768 at most; or ``exactly`` as many as another rendering took, to be judged beside it: with the
+        same seed they are the same samples.
 
-        Parameters
-        ----------
-        image, spp, seed
-            As of :meth:`render`; ``spp`` also "auto".
-        exactly : int, optional
-            With "auto": as many samples as another rendering took, to be judged beside it: with the same seed
-            they are the same samples.
-
-        Returns
-        -------
-        picture : array (height, width, 3) float32
-            Linear radiance.
-        spp : int
-            Samples a pixel that were taken.
-        noise : array (height, width) float64 or None
-            Standard error of display values, RMS over channels; None where samples were given.
+        Returns the picture (height, width, 3) float32, linear radiance; the samples a pixel that were taken;
+        and the standard error of display values, RMS over channels, (height, width) float64, None where
+        ``spp`` is a number.
         """
         if not isinstance(spp, str):
             return self.render(image, spp, seed), spp, None
@@ -508,7 +477,8 @@ def relit(
     _change_nodes(state, where, folders, _Refusals())
     emitter["filename"] = envmap
     emitter["scale"] = own.scale
-    supported.ensure_integrator(state)
+    if not any(node.type == mi.ObjectType.Integrator for node in state.nodes):
+        parser.append(state, mi.ObjectType.Integrator, "path")
     return mi.parser.write_string(state)
 
 

@@ -178,13 +178,6 @@ def polarised(state: mi.parser.ParserState) -> tuple[str, ...]:
     return (f"{', '.join(names)}: rendered without polarisation",) if names else ()
 
 
-def ensure_integrator(state: mi.parser.ParserState) -> None:
-    """Give a scene without an integrator ``path``; may move its nodes, as :func:`.parser.append`."""
-    if any(n.type == mi.ObjectType.Integrator for n in state.nodes):
-        return
-    parser.append(state, mi.ObjectType.Integrator, "path")
-
-
 def _check_media(state, where, integrator, notes):
     """Refuse media that the scene's integrator would render; say that another one leaves them out."""
     media = [n for n in state.nodes if n.type == mi.ObjectType.Medium]

@@ -73,18 +73,9 @@ def test_load_envmap_refusals(tmp_path):
     assert not found.any() and "black" in info["warnings"][0]
 
 
-@pytest.mark.parametrize(("height", "width", "what"), [
-    (192, 32, "the shape of a cube map in a column; convert it to lat-long"),
-    (32, 192, "the shape of a cube map in a row; convert it to lat-long"),
-    (64, 48, "the shape of a cube map as a vertical cross; convert it to lat-long"),
-    (48, 64, "the shape of a cube map as a horizontal cross; convert it to lat-long"),
-    (16, 16, "the shape of a mirror ball, an angular map or a fisheye; convert it to lat-long"),
-    (16, 64, "the shape of half a sphere; add the rows of the other half"),
-    (17, 64, "crop or resize it"),
-])  # fmt: skip
-def test_what_is_not_lat_long_is_named(height, width, what, tmp_path):
-    path = exr(tmp_path / "a.exr", **{c: np.ones((height, width), np.float32) for c in "RGB"})
-    with pytest.raises(InputError, match=rf"a.exr: .* is 2:1, this is {width} x {height}[,;] {what}$"):
+def test_what_is_not_lat_long_is_refused(tmp_path):
+    path = exr(tmp_path / "a.exr", **{c: np.ones((48, 64), np.float32) for c in "RGB"})
+    with pytest.raises(InputError, match=r"a.exr: .* is 2:1, this is 64 x 48; crop it, or convert it to lat"):
         images.load_envmap(path)
 
 

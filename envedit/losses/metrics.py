@@ -16,7 +16,7 @@ import numpy as np
 from envedit.core.color import luminance
 from envedit.core.color import tonemap as apply_tonemap
 from envedit.core.errors import InputError, place_of
-from envedit.core.types import Views
+from envedit.core.types import ArrayLike, Views
 
 if TYPE_CHECKING:
     from envedit.losses.perceptual import distances
@@ -41,7 +41,8 @@ LOG_EPS = 0.01
 """Radiance added before a logarithm, so that black has one; small beside any daylight sky."""
 
 
-def _checked(image, name):
+def checked(image: ArrayLike, name: str) -> np.ndarray:
+    """Return an image (H, W, 3) in float64; InputError, which names it, if it is none or not finite."""
     image = np.asarray(image, np.float64)
     if image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
         raise InputError(f"{name}: expected an image of shape (H, W, 3), got {image.shape}.")
@@ -53,7 +54,7 @@ def _checked(image, name):
 
 
 def _pair(a, b):
-    a, b = _checked(a, "first image"), _checked(b, "second image")
+    a, b = checked(a, "first image"), checked(b, "second image")
     if a.shape != b.shape:
         raise InputError(f"images differ in shape: {a.shape} and {b.shape}; resize one to the other first.")
     return a, b
@@ -252,7 +253,7 @@ def log_psnr(a: np.ndarray, b: np.ndarray) -> float | None:
 
 def peak_position(image: np.ndarray) -> tuple[int, int]:
     """Find the row and column of the greatest luminance, the first of several."""
-    values = luminance(_checked(image, "image"))
+    values = luminance(checked(image, "image"))
     row, column = np.unravel_index(int(np.argmax(values)), values.shape)
     return int(row), int(column)
 
@@ -293,7 +294,7 @@ def high_frequency_energy(image: np.ndarray) -> float:
     (1, 4, 6, 4, 1) / 16 on either axis; columns are periodic, the outermost rows repeat. Independent noise of
     variance s^2 gives 0.794 s^2 (squared taps: 1 - 2 (6/16)^2 + (70/256)^2), a smooth gradient about 0.
     """
-    values = _log(luminance(_checked(image, "image")))
+    values = _log(luminance(checked(image, "image")))
     height, width = values.shape
     padded = np.pad(values, ((2, 2), (0, 0)), mode="edge")
     blurred = sum(tap * padded[k : k + height] for k, tap in enumerate(_BINOMIAL))

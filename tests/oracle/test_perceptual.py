@@ -258,7 +258,7 @@ def test_what_is_not_finite_is_not_hidden(dists, lpips, bad):
         assert np.isnan(distance(single(y), single(x))[0])
     value, slope = gradient(dists.against(single(y)), single(x))
     assert np.isnan(value) and np.isnan(slope).any()
-    with pytest.raises(InputError, match="first image: 1 pixel.* not finite, the first at row 20, column 7"):
+    with pytest.raises(InputError, match=r"first image: 1 texel.* not finite, the first at row 20, column 7"):
         lpips["alex"](x, y)
     with pytest.raises(InputError, match="too large to compare"):
         lpips["alex"](np.full_like(y, 1e30), y)

@@ -20,8 +20,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from envedit.core.errors import InputError, place_of
+from envedit.core.errors import InputError
 from envedit.core.types import DrArray, FilePath, Shape, Tensor
+from envedit.losses.metrics import checked
 from envedit.losses.perceptual import weights
 from envedit.losses.perceptual.backbones import Backbone
 from envedit.losses.perceptual.convolution import Divisor
@@ -50,13 +51,8 @@ def _check(image: Tensor, name: str) -> None:
 
 
 def _single(image: Any, name: str) -> mi.TensorXf:
-    """Return an image, array or tensor, in single precision, refusing what is not finite."""
-    image = np.ascontiguousarray(image, np.float32)
-    _check(image, name)
-    bad = ~np.isfinite(image).all(axis=2)
-    if bad.any():
-        where = f"the first at {place_of(bad)}"
-        raise InputError(f"{name}: {bad.sum()} pixel(s) are not finite, {where}; repair the image first.")
+    """Return an image, array or tensor, in single precision; errors as of :func:`.metrics.checked`."""
+    image = np.ascontiguousarray(checked(image, name), np.float32)
     return mi.TensorXf(image)
 
 

@@ -7,7 +7,7 @@ import hashlib
 import mitsuba as mi
 import numpy as np
 
-from envedit.core.array_cache import DiskCache, cache_folder, holds
+from envedit.core.array_cache import DiskCache, cache_folder
 from envedit.scene.scene import Scene
 
 MOST_BYTES = 500_000_000
@@ -32,13 +32,9 @@ def rendered(
         "map": [image.shape, hashlib.sha256(image.tobytes()).hexdigest()],
         "samples": [spp, seed, exactly],
     }
-    size = scene.height, scene.width
-    kept: dict[str, tuple] = {"picture": ("f4", (*size, 3)), "spp": ("i8", ())}
-    if isinstance(spp, str):
-        kept["noise"] = "f8", size
 
     # ---- From disk, or rendered and stored
-    stored = cache.load(key, lambda arrays: holds(arrays, kept) and bool(arrays["spp"] > 0))
+    stored = cache.load(key)
     if stored is not None:
         noise = np.array(stored["noise"]) if "noise" in stored else None
         return np.array(stored["picture"]), int(stored["spp"]), noise

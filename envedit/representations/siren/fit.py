@@ -21,7 +21,7 @@ import mitsuba as mi
 import numpy as np
 
 from envedit import config
-from envedit.core.array_cache import DiskCache, holds
+from envedit.core.array_cache import DiskCache
 from envedit.core.arrays import tensor
 from envedit.core.errors import NumericalError
 from envedit.core.radiance import require_radiance
@@ -118,7 +118,7 @@ def fit(
     # ---- The same fit from disk
     cache = DiskCache(folder if settings.cache else None)
     key = _key(image, network, settings, seed, rows)
-    if stored := cache.load(key, lambda arrays: _whole(arrays, network)):
+    if stored := cache.load(key):
         return _read(stored)
 
     # ---- Training, continued if it was begun
@@ -293,10 +293,7 @@ class _Begun:
 
     def restore(self, adam: optimizer.Adam) -> tuple[int, int]:
         """Bring the optimiser to where it was; returns epochs done and steps refused."""
-        expected = {k: (v.dtype, v.shape) for k, v in adam.state_dict().items()} | {_ABOUT: ("f8", (3,))}
-        state = self._cache.load(
-            self._key, lambda arrays: holds(arrays, expected) and arrays[_ABOUT].min() >= 0
-        )
+        state = self._cache.load(self._key)
         if not state:
             return 0, 0
         state = dict(state)
@@ -355,23 +352,6 @@ def _stored(fitted: Fitted) -> dict[str, np.ndarray]:
     about = [getattr(fitted, name) for name in _NUMBERS]
     range_ = fitted.normalisation
     return fitted.params | {_ABOUT: np.array([range_.low, range_.span, *about], np.float64)}
-
-
-def _whole(arrays, network):
-    """Return whether arrays from disk are a fit of such a network."""
-    inputs = 2 if network.coordinates == "plane" else 3
-    parameters = siren.init(0, network.hidden, network.depth, network.omega, inputs)
-    shapes = {name: value.shape for name, value in parameters.items()}
-    about = arrays[_ABOUT]
-    params = {name: array for name, array in arrays.items() if name != _ABOUT}
-    return (
-        holds(params, {name: ("f4", shape) for name, shape in shapes.items()})
-        and about.dtype == np.float64
-        and about.shape == (2 + len(_NUMBERS),)
-        and bool(np.isfinite(about[:2]).all() and about[1] >= 0 and not np.isinf(about).any())
-        and about[2 + _NUMBERS.index("epochs")] >= 0
-        and about[2 + _NUMBERS.index("seconds")] >= 0
-    )
 
 
 def _read(arrays: dict[str, np.ndarray]) -> Fitted:

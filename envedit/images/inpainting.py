@@ -11,6 +11,7 @@ import numpy as np
 
 from envedit.core import latlong
 from envedit.core.extras import required
+from envedit.core.resampling import bilinear
 from envedit.core.rows import bands
 
 MOST_PIXELS = 1024
@@ -56,9 +57,10 @@ def filled(envmap: np.ndarray, weight: np.ndarray) -> np.ndarray:
     plane = np.stack([x * sine, y * sine, np.cos(angle)], axis=-1) @ frame
 
     # ---- The map in it; unknown is what reads a texel of the region
-    corners, shares = _around(latlong.texel_position(plane, height, width), (height, width))
-    unknown = np.logical_or.reduce([mask[corner] for corner in corners]) | (angle > np.pi)
-    known = sum(share[..., None] * envmap[corner] for corner, share in zip(corners, shares, strict=True))
+    row, column = latlong.texel_position(plane, height, width)
+    known = bilinear(envmap, row, column, around=True)
+    unknown = bilinear(mask[..., None], row, column, around=True)[..., 0] > 0
+    unknown |= angle > np.pi
     ring = cv2.dilate(unknown.astype(np.uint8), np.ones(2 * (2 * RADIUS + 1,), np.uint8)) > 0
     ring &= ~unknown
     if not ring.any():
@@ -76,9 +78,7 @@ def filled(envmap: np.ndarray, weight: np.ndarray) -> np.ndarray:
         x, y, z = (toward @ frame.T).T
         across = np.hypot(x, y)
         stretch = np.arctan2(across, z) / np.maximum(across, 1e-12) / pixel
-        place = np.clip(np.stack([y, x]) * stretch + half, 0, 2 * half)
-        corners, shares = _around(place, image.shape[:2], wrap=False)
-        filling = sum(share[:, None] * image[at] for at, share in zip(corners, shares, strict=True))
+        filling = bilinear(image, y * stretch + half, x * stretch + half)
         share = weight[band][rows, columns][:, None]
         old = envmap[band][rows, columns]
         result[band][rows, columns] = np.where(share == 1, filling, old + share * (filling - old))
@@ -118,17 +118,3 @@ def _cap(mask):
     right /= np.linalg.norm(right)
     away = 2 * np.arcsin(np.minimum(np.linalg.norm(toward - middle, axis=1) / 2, 1)).max()
     return np.stack([right, np.cross(middle, right), middle]), away + 2 * step * np.pi / (height - 1)
-
-
-def _around(place, shape, wrap=True):
-    """Return the four indices around places (rows, columns), and their shares in bilinear interpolation."""
-    row, column = place
-    height, width = shape
-    top = np.clip(np.floor(row).astype(np.int64), 0, max(height - 2, 0))
-    left = np.floor(column).astype(np.int64)
-    if not wrap:
-        left = np.clip(left, 0, width - 2)
-    down, right = row - top, column - left
-    corners = [(top + i, (left + j) % width) for i in (0, 1) for j in (0, 1)]
-    shares = [(1 - down) * (1 - right), (1 - down) * right, down * (1 - right), down * right]
-    return corners, shares

@@ -27,11 +27,6 @@ MOST_BYTES = 2**32
 def replacing(path: FilePath, suffix: str = "") -> Iterator[Path]:
     """Give a temporary name in the same folder, and move what was written there to ``path`` at the end.
 
-    .. code-block:: python
-
-       with replacing("sky.exr", ".exr") as temporary:
-           library.write(str(temporary))
-
     A reader sees the old file or the new one. If anything fails the old file stays and the temporary one is
     removed.
 

@@ -83,7 +83,7 @@ class MovedLights:
         size = dr.opaque(mi.Float, factor)
         centre = vectors(mi.Vector3f, self.layers.lights.centres[light])
         turn = vectors(mi.Vector3f, self.turn[light])
-        sine = flat(mi.Float, np.sin(np.pi * row / max(self.height - 1, 1)).astype(np.float32)) * size
+        sine = flat(mi.Float, np.sin(np.pi * row / (self.height - 1)).astype(np.float32)) * size
         places = lights.placed(point, centre, turn, size, sine, (self.height, self.width))
         dr.eval(places)
         reach = places[0].numpy()
@@ -97,7 +97,7 @@ class MovedLights:
         own = self.layers.lights
         centre = rotated(own.centres[light], self.turn[light])
         radius = float(lights.size_factor(self.size[light, 0])) * math.radians(lights.LOBE_DEGREES)
-        radius = math.hypot(radius, NARROWEST * np.pi / max(self.height - 1, 1))
+        radius = math.hypot(radius, NARROWEST * np.pi / (self.height - 1))
 
         # ---- Its sum over the texels
         omega = latlong.lookup_solid_angles(self.height, self.width)

@@ -33,9 +33,9 @@ class SourceCores:
             self.surveyed = Places(grid.shape, Rows(start, rows, total), columns)
             self.labelled = self.survey.label >= 0
             self.label = grown(self.survey.label)
-        theta = np.pi * np.arange(height) / max(height - 1, 1)
+        theta = np.pi * np.arange(height) / (height - 1)
         sine = np.sin(theta)
-        sine[-1] = 0.0 if height > 1 else 1.0
+        sine[-1] = 0.0
         phi = 2 * np.pi * (np.arange(width) + 0.5) / width
         self._theta = [flat(mi.Float, t.astype(np.float32)) for t in (sine, np.cos(theta))]
         self._phi = [flat(mi.Float, f(phi).astype(np.float32)) for f in (np.sin, np.cos)]

@@ -56,7 +56,7 @@ class Places:
         height, width = shape
 
         # ---- Row of the coarser image with its fraction, the nearest, and the source's rows that have one
-        self.place = np.arange(height) * ((rows.total - 1) / max(height - 1, 1)) - rows.first
+        self.place = np.arange(height) * ((rows.total - 1) / (height - 1)) - rows.first
         nearest = np.rint(self.place)
         self.row = np.clip(nearest, 0, self.count - 1).astype(np.int64)
         inside = np.flatnonzero((nearest >= 0) & (nearest < self.count))

@@ -85,7 +85,7 @@ def blended(edited: np.ndarray, original: np.ndarray, keep: np.ndarray) -> np.nd
 def _weight(region: Region, height: int, width: int) -> np.ndarray:
     """Return the weight of a region in every texel, (H, W) float32."""
     weight = np.empty((height, width), np.float32)
-    texel = np.degrees(max(np.pi / max(height - 1, 1), 2 * np.pi / width))
+    texel = np.degrees(max(np.pi / (height - 1), 2 * np.pi / width))
     fade = max(region["softness"], texel)
     for band in bands(height, ROWS):
         if "points" in region:
@@ -105,7 +105,7 @@ def _within_brush(points, radius, fade, shape, band):
     inwards = np.full((band.stop - band.start, width), -np.inf)
     azimuth, elevation = np.radians(points).T
     ends = latlong.on_sphere(np.pi / 2 - elevation, azimuth)
-    polar = np.pi * np.arange(band.start, band.stop) / max(height - 1, 1)
+    polar = np.pi * np.arange(band.start, band.stop) / (height - 1)
     for a, b in zip(ends[: max(len(ends) - 1, 1)], ends[1:] if len(ends) > 1 else ends, strict=True):
         # ---- Texels in a cap around the arc
         middle = a + b if np.linalg.norm(a + b) > 1e-6 else a
@@ -137,7 +137,7 @@ def _within_brush(points, radius, fade, shape, band):
 def _within_polygon(corners, shape, band):
     """Return the degrees inwards from the border of a polygon in a band of rows, (n, W)."""
     height, width = shape
-    elevation = 90 - 180 * np.arange(band.start, band.stop) / max(height - 1, 1)
+    elevation = 90 - 180 * np.arange(band.start, band.stop) / (height - 1)
     elevation = np.clip(elevation, -90 + 1e-9, 90 - 1e-9)[:, None]  # the poles belong to what reaches them
     azimuth = 360 * (np.arange(width) + 0.5) / width
     squeeze = np.cos(np.radians(elevation))

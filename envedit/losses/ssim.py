@@ -110,12 +110,6 @@ class Ssim:
         mass = total(values)
         return dr.select(mass > 0, values / type(values)(mass), 0)
 
-    def _row_start(self):
-        """Index, in an array with full-length rows, of each window's first column."""
-        height, width, channels = self.map_shape
-        index = dr.arange(dr.uint32_array_t(type(self._y)), height * width * channels)
-        return index + index // (width * channels) * ((self.shape[1] - width) * channels)
-
     def _moments(self, *fields):
         """Filter along columns: mean and variance of each field."""
         row = self.shape[1] * self.shape[2]
@@ -130,9 +124,11 @@ class Ssim:
 
     def _window(self, moments):
         """Merge the moments of the columns of a window into its means and variances."""
-        start = self._row_start()
-        step = self.shape[2]
+        height, width, step = self.map_shape
         F = type(self._y)
+        index = dr.arange(dr.uint32_array_t(F), height * width * step)
+        # The first column of each window, in an array whose rows have full length.
+        start = index + index // (width * step) * ((self.shape[1] - width) * step)
         merged = []
         for mean, variance in zip(moments[::2], moments[1::2], strict=True):
             means = [dr.gather(F, mean, start + j * step) for j in range(len(self._columns))]

@@ -87,10 +87,9 @@ def export(
 
     It is float32 OpenEXR, or 16-bit PNG. The file says which tonemap it is under (``name``, by default
     :func:`export_tonemap`), and what it was rendered from. As editors drop that, a file beside it, with
-    :data:`NEIGHBOUR` after its name, says it too. Errors are those of :func:`check_export`, and InputError if
-    the file cannot be written.
+    :data:`NEIGHBOUR` after its name, says it too. InputError if the file cannot be
+    written; :func:`check_export` is what refuses others.
     """
-    check_export(file)
     linear = Path(os.fsdecode(file)).suffix.lower() == ".exr"
     name = name or export_tonemap(file, picture, settings)
     facts = origin(settings, picture.shape, name)

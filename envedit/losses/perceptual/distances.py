@@ -207,11 +207,6 @@ def _variances(values, mean):
 class Lpips:
     """LPIPS v0.1: how different two images look to features that were calibrated on people's judgements.
 
-    .. code-block:: python
-
-       lpips = Lpips("alex", "alexnet.npz", "lpips_v0.1_alex.npz")
-       lpips(a, b)                                # a float
-
     Zhang et al. 2018 ("The unreasonable effectiveness of deep features as a perceptual metric",
     Eq. 1), as in the authors' PyTorch code, version 0.1: features of every tapped layer, divided by
     their length at each pixel; squared differences, weighted by channel, averaged over pixels, summed

@@ -108,7 +108,7 @@ def test_features_in_bands_are_the_same(backbones, monkeypatch, rng):
 
 
 def test_max_pooling_does_not_lose_nan():
-    pool = convolution.MaxPool(3, 2, (5, 5, 1), (2, 2, 1))
+    pool = convolution.MaxPool(3, (5, 5, 1), (2, 2, 1))
     x = np.zeros((5, 5))
     x[2, 2] = 1  # under all four windows
     np.testing.assert_array_equal(np.array(pool.forward(mi.Float64(x.ravel()))), 1)

@@ -38,10 +38,9 @@ class Conv:
 
 @dataclass(frozen=True)
 class Pool:
-    """Max pooling."""
+    """Max pooling of every second pixel."""
 
     kernel: int
-    stride: int = 2
 
 
 def _vgg16():
@@ -139,7 +138,7 @@ def _size_after(layer, n, pooling):
         return max((n + 2 * layer.padding - layer.kernel) // layer.stride + 1, 0)
     if pooling == "hanning":
         return (n - 1) // 2 + 1
-    return max((n - layer.kernel) // layer.stride + 1, 0)
+    return max((n - layer.kernel) // 2 + 1, 0)
 
 
 def _as_matrix(layer, tensors):
@@ -176,7 +175,7 @@ class Stack:
             elif pooling == "hanning":
                 step = convolution.HanningPool(before, (*after, channels))
             else:
-                step = convolution.MaxPool(layer.kernel, layer.stride, before, (*after, channels))
+                step = convolution.MaxPool(layer.kernel, before, (*after, channels))
             self._steps.append(step)
 
     def forward(self, x: DrArray) -> list:

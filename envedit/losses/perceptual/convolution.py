@@ -204,11 +204,11 @@ class Convolution:
 
 
 class MaxPool:
-    """Max pooling."""
+    """Max pooling, every second pixel."""
 
-    def __init__(self, kernel: int, stride: int, before: Shape, after: Shape):
+    def __init__(self, kernel: int, before: Shape, after: Shape):
         self._kernel = kernel
-        self._windows = _Windows(before, after, kernel, stride, 0)
+        self._windows = _Windows(before, after, kernel, 2, 0)
 
     def forward(self, x: DrArray) -> DrArray:
         """Return the largest of every window, NaN where it has one."""

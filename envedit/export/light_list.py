@@ -80,16 +80,8 @@ def listed(separated: list[Light], shape: tuple[int, int], to_world: np.ndarray)
     They are ``separated`` from linear radiance that reaches the scene; ``to_world`` (3, 3) is the rotation
     from the map's frame (+y up) to the scene's.
 
-    Returns of each, in a dict:
-
-    - ``azimuth`` and ``elevation`` in degrees: the light is at column azimuth / 360 W - 1/2 and row
-      (90 - elevation) / 180 (H - 1);
-    - ``direction``: unit vector towards it in the scene;
-    - ``solid_angle``: of its texels, steradian;
-    - ``radius_50``, ``radius_97``: degrees from its direction within which lie half and 97 % of its flux;
-      ``angle``: twice the latter;
-    - ``flux``: integral of its radiance over its solid angle, RGB, which is its irradiance on a surface that
-      faces it; ``irradiance``: on the horizontal plane of the map, flux max(sin(elevation), 0).
+    Returns a dict each, with ``azimuth``, ``elevation``, ``direction``, ``solid_angle``, ``radius_50``,
+    ``radius_97``, ``angle``, ``flux`` and ``irradiance`` as ``docs/pipelines.md`` describes them.
     """
     height, width = shape
     omega = latlong.lookup_solid_angles(height, width)

@@ -26,17 +26,8 @@ patches that two of those skies have. Towards a rendering another sky can be mea
 def natural(edited: np.ndarray, original: np.ndarray, true: np.ndarray | None = None) -> dict:
     """Compare an edited map with the original, and with the true map, which makes the target, where known.
 
-    They are whole maps (H, W, 3), linear radiance. Returned are, None where the denominator is 0:
-
-    - ``colours_outside``, the share of the upper half's solid angle whose log chroma (log radiance less its
-      mean over channels) lies outside the 1st to 99th percentile of original and true map together, by more
-      than 0.1, in any channel;
-    - ``seam``, mean |log luminance step| across the horizon over the original's;
-    - ``high_frequency``, energy of high frequencies (:func:`.high_frequency_energy`) over the larger of the
-      original's and the true map's;
-    - ``white``, the share of the upper half's solid angle that is display white in all channels, less the
-      original's;
-    - ``patches``, :func:`patches` of the edit, over those between two photographed skies.
+    They are whole maps (H, W, 3), linear radiance. Returned are the numbers of ``natural`` in
+    ``docs/outputs.md``; None where the denominator is 0.
     """
     known = [original] if true is None else [original, true]
     sharp = max(high_frequency_energy(envmap) for envmap in known)
@@ -106,7 +97,11 @@ def cells(envmap: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def colours_outside(edited: np.ndarray, known: list[np.ndarray]) -> float:
-    """Return the share of the upper half's solid angle in colours that none of the known maps has."""
+    """Return the share of the upper half's solid angle in colours that none of the known maps has.
+
+    Those are log chroma, log radiance less its mean over channels, that in any channel is beyond
+    :data:`PERCENTILES` of all known maps by more than :data:`MARGIN`.
+    """
     sky, omega = _upper(edited)
     both = np.concatenate([_chroma(_upper(envmap)[0]).reshape(-1, 3) for envmap in known])
     low, high = np.percentile(both, PERCENTILES, axis=0)

@@ -57,11 +57,6 @@ C1, C2 = 0.01**2, 0.03**2
 class Ssim:
     r"""Structural similarity to a fixed reference, with a hand-written gradient.
 
-    .. code-block:: python
-
-       ssim = Ssim(reference, weight)
-       loss = ssim(x)                    # 1 - mean SSIM, differentiable in x
-
     Wang et al. 2004 ("Image quality assessment: from error visibility to structural similarity", Eq. 13):
     Gaussian window of 11 x 11, sigma 1.5, K1 = 0.01, K2 = 0.03, population covariance, windows that lie
     wholly inside the image, one map per channel, averaged. It is scikit-image's ``structural_similarity``

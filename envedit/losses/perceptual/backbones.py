@@ -74,14 +74,6 @@ KINDS = {
 class Backbone:
     """The weights of a feature stack.
 
-    .. code-block:: python
-
-       backbone = Backbone.load("vgg", "vgg16.npz")
-       stack = backbone.stack(64, 256)
-       tape = stack.forward(x)              # flat, 64 * 256 * 3 numbers, normalised as the network requires
-       taps = stack.taps(tape)              # [(flat array of N * C numbers, N, C), ...]
-       gradient = stack.backward(tape, [gradient of the first tap, None, ...])
-
     ``kind`` is one of :data:`KINDS`; ``tensors`` are torchvision's state dict, as far as it is named
     ``features.*``: float32 arrays.
     """

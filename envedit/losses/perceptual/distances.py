@@ -74,12 +74,6 @@ def _along(values: DrArray, length: int) -> DrArray:
 class Dists:
     r"""Deep image structure and texture similarity, a distance: the regulariser L_dists of Eq. 10.
 
-    .. code-block:: python
-
-       dists = Dists(Backbone.load("vgg", "vgg16.npz"), "dists_alpha_beta.npz")
-       to_original = dists.against(original)      # the original's features are computed once
-       loss = to_original(x)                      # differentiable in x
-
     Ding et al. 2020 ("Image quality assessment: unifying structure and texture similarity"), as in the
     authors' PyTorch code: the image itself and five feature maps of VGG16 whose max poolings are replaced by
     Hanning L2 poolings. With means mu, variances var and covariance cov over the pixels of a channel,

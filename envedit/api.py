@@ -169,6 +169,7 @@ def fit(
     pixels = _array("image", image)
     if pixels.ndim != 3 or pixels.shape[2] != 3:
         raise InputError(f"image: got an array of shape {pixels.shape}, expected (H, W, 3)")
+    config.Config(seed=seed)  # checks it
     if isinstance(network, Mapping):
         network = config.Representation(**{"kind": "siren", **network})
     if isinstance(settings, Mapping):
@@ -218,8 +219,8 @@ def load_scene(
     settings = config.Scene(
         width=width,
         height=height,
-        parameters=dict(parameters or {}),
-        sensors=sensors if isinstance(sensors, str) else tuple(sensors),
+        parameters=dict(parameters) if isinstance(parameters, Mapping) else parameters or {},
+        sensors=tuple(sensors) if isinstance(sensors, Sequence) and not isinstance(sensors, str) else sensors,
     )
     return built_scene.load(scene, settings, base)
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import zlib
+from numbers import Integral
 
 import numpy as np
 
@@ -71,7 +72,10 @@ def read_stored(path: FilePath) -> tuple[np.ndarray, dict]:
 
 
 def _decode(path, stored, space=marks.AUTO):
-    name = os.fsdecode(path)
+    try:
+        name = os.fsdecode(path)
+    except TypeError:
+        raise InputError(f"image: got {type(path).__name__}, expected the path of a file") from None
     head = head_of(name)
     info: Info = {"path": name, "format": None, "size": None, "hdr": True, "metadata": {}, "warnings": []}
     info["marks"] = {}
@@ -125,8 +129,9 @@ def load_envmap(
     the file cannot be read, is not 2:1 to a texel, is smaller than 6 x 3, or holds texels that are not
     finite; ConfigError if ``width`` is odd or less than 6.
     """
-    if width is not None and (width < 6 or width % 2 or width > MAX_SIDE):
-        raise ConfigError(f"width of the environment map must be even, from 6 to {MAX_SIDE}, got {width}")
+    whole = width is None or (isinstance(width, Integral) and 6 <= width <= MAX_SIDE and width % 2 == 0)
+    if not whole:
+        raise ConfigError(f"width of the environment map must be even, from 6 to {MAX_SIDE}, got {width!r}")
     # ---- Read
     if isinstance(path, np.ndarray):
         image, info = _of_array(path, name, space)

@@ -161,7 +161,8 @@ class LightTransport:
         Raises
         ------
         ConfigError
-            ``spp`` or ``max_depth`` is below 1, or the scene's parameters or sensors cannot be used.
+            ``spp`` or ``max_depth`` is below 1, the grid or ``seed`` is no whole number, ``memory_gb`` is no
+            number, or the scene's parameters or sensors cannot be used.
         InputError
             The scene cannot be loaded, no pixel receives light from the environment, T does not fit into
             ``memory_gb``, or the grid is smaller than Mitsuba takes.
@@ -175,17 +176,21 @@ class LightTransport:
         if mi.variant() is None:
             mi.set_variant("llvm_ad_rgb")
         scene = built_scene.load(scene, config.Scene())
+        for side, texels in (("height", height), ("width", width)):
+            if not _whole(texels, 1):
+                raise ConfigError(f"{side}: got {texels!r}, expected a whole number of texels")
         latlong.check_envmap_size(height, width)
+        if not _whole(seed, 0):
+            raise ConfigError(f"seed: got {seed!r}, expected a whole number of at least 0")
         memory_gb = sampling_plan.allowed(memory_gb)
         for name, value in (("spp", spp), ("max_depth", max_depth)):
-            whole = isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= 1
-            if value != "auto" and not whole:
+            if value != "auto" and not _whole(value, 1):
                 raise ConfigError(
                     f"renderer.{name}: got {value!r}, expected a whole number of at least 1, or auto"
                 )
 
         # ---- How T is sampled, by a few paths under a white sky
-        cache = DiskCache(folder)
+        cache = DiskCache(None if folder is None else Path(folder))
         origin = {
             "version": [_RECORDING, mi.__version__, mi.variant()],
             "scene": [scene.digest, scene.width, scene.height],
@@ -341,12 +346,10 @@ class LightTransport:
 
         Raises
         ------
-        ValueError
-            The map has another shape.
+        InputError
+            The map has another shape, or is no array of numbers.
         """
-        envmap = tensor(envmap) if isinstance(envmap, np.ndarray) else envmap
-        _check(envmap, (*self.grid.shape, 3), "map")
-        return dr.custom(_Apply, self, envmap)
+        return dr.custom(_Apply, self, _as_tensor(envmap, (*self.grid.shape, 3), "map"))
 
     def linear(self, maps: mi.TensorXf) -> mi.TensorXf:
         """Render maps without the light of other lamps: T E, not differentiable.
@@ -355,7 +358,7 @@ class LightTransport:
         work than one. Returns (h, w, 3), or (k, h, w, 3).
         """
         many = maps.shape[0] if maps.ndim == 4 else 1
-        _check(maps, (*maps.shape[:-3], *self.grid.shape, 3), "map")
+        _check_shape(maps, (*maps.shape[:-3], *self.grid.shape, 3), "map")
         return mi.TensorXf(self._products(maps, many), (*maps.shape[:-3], *self.shape, 3))
 
     def other_light(self) -> np.ndarray:
@@ -399,10 +402,8 @@ class LightTransport:
             exact.trace(todo, self.paths[0], self.seed, np.concatenate([main, self._recent]))
 
     def adjoint(self, image: mi.TensorXf | np.ndarray) -> mi.TensorXf:
-        """Pull a picture (h, w, 3) back to the map: T' I, (H, W, 3); ValueError for another shape."""
-        image = tensor(image) if isinstance(image, np.ndarray) else image
-        _check(image, (*self.shape, 3), "picture")
-        return self._adjoint(image)
+        """Pull a picture (h, w, 3) back to the map: T' I, (H, W, 3); InputError for another shape."""
+        return self._adjoint(_as_tensor(image, (*self.shape, 3), "picture"))
 
     def render(self, envmap: mi.TensorXf, step: int) -> mi.TensorXf:
         """Render a map: the interface that all renderers share.
@@ -524,9 +525,13 @@ class LightTransport:
         int
             Number of columns traced. Texels stay exact while there is room; then those make room that have
             been bright in no map for longest.
+
+        Raises
+        ------
+        InputError
+            The map has another shape, is no array of numbers, or is masked.
         """
-        require_unmasked(envmap, "light transport")
-        envmap = np.asarray(envmap)
+        envmap = _as_array(envmap, (*self.grid.shape, 3), "map")
         exact = self._exact
         bright = self._bright = self.bright_texels(envmap, tolerance)[: exact.capacity]
         before = self._recent[~np.isin(self._recent, bright)]
@@ -557,11 +562,13 @@ class LightTransport:
         Raises
         ------
         InputError
-            If a texel is not finite or negative: no error can be predicted then.
+            If the map has another shape, or a texel is not finite or negative: no error can be predicted
+            then.
         """
+        envmap = _as_array(envmap, (*self.grid.shape, 3), "map")
         require_radiance(envmap, "light transport")
         rest = self._exact.slot_of < 0
-        radiance, omega = self._radiance(np.asarray(envmap))
+        radiance, omega = self._radiance(envmap)
         return bright_texels.error(radiance, omega, self._samples, rest)
 
     @property
@@ -583,6 +590,11 @@ class LightTransport:
         return bright_texels.brightest(radiance, omega, self._samples, tolerance)
 
 
+def _whole(value, least):
+    """Return whether a value is a whole number that is not less than ``least``."""
+    return isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= least
+
+
 def _within(numbers, least, most):
     """Return whether all of some numbers, of which there may be none, are in a range."""
     return bool(((least <= numbers) & (numbers <= most)).all())
@@ -593,9 +605,31 @@ def _under(arrays, part):
     return {k.removeprefix(f"{part}/"): a for k, a in arrays.items() if k.startswith(f"{part}/")}
 
 
-def _check(tensor, shape, what):
-    if tuple(tensor.shape) != shape:
-        raise ValueError(f"light transport: the {what} must have shape {shape}, got {tuple(tensor.shape)}")
+def _as_tensor(values, shape, what):
+    """Return a map or a picture as a tensor; InputError where it has another shape or holds no numbers."""
+    if not isinstance(values, mi.TensorXf):
+        return tensor(_as_array(values, shape, what))
+    _check_shape(values, shape, what)
+    return values
+
+
+def _as_array(values: ArrayLike, shape: tuple[int, ...], what: str) -> np.ndarray:
+    """Return a map or a picture as an array; InputError where it has another shape or holds no numbers."""
+    require_unmasked(values, "light transport")
+    try:
+        array = np.asarray(values)
+    except (TypeError, ValueError):  # rows of different lengths
+        array = np.asarray(None)
+    if array.dtype.kind not in "fiub":
+        kind = type(values).__name__
+        raise InputError(f"light transport: the {what} must be an array of numbers, got {kind}")
+    _check_shape(array, shape, what)
+    return array
+
+
+def _check_shape(values, shape, what):
+    if tuple(values.shape) != shape:
+        raise InputError(f"light transport: the {what} must have shape {shape}, got {tuple(values.shape)}")
 
 
 class _Apply(dr.CustomOp):

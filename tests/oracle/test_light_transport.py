@@ -569,10 +569,22 @@ def test_another_seed_needs_no_other_kernel(lamp_scene):
 
 def test_wrong_shapes_are_refused(lit):
     for shape in ((HEIGHT, WIDTH + 2, 3), (WIDTH, HEIGHT, 3), (HEIGHT, WIDTH, 4), (HEIGHT * WIDTH, 3)):
-        with pytest.raises(ValueError, match=r"map must have shape \(16, 32, 3\), got \("):
+        with pytest.raises(InputError, match=r"map must have shape \(16, 32, 3\), got \("):
             lit.apply(dr.ones(mi.TensorXf, shape))
-    with pytest.raises(ValueError, match=r"picture must have shape \(17, 23, 3\), got \(23, 17, 3\)"):
+        for takes_arrays in (lit.resolve, lit.coarse_error):
+            with pytest.raises(InputError, match=r"map must have shape \(16, 32, 3\), got \("):
+                takes_arrays(np.ones(shape))
+    with pytest.raises(InputError, match=r"picture must have shape \(17, 23, 3\), got \(23, 17, 3\)"):
         lit.adjoint(dr.ones(mi.TensorXf, (23, 17, 3)))
+
+
+@pytest.mark.parametrize("values", [None, "sky.exr", [[1.0], [1.0, 2.0]]])
+def test_what_is_no_array_of_numbers_is_refused(lit, values):
+    for takes_maps in (lit.apply, lit.resolve, lit.coarse_error):
+        with pytest.raises(InputError, match="the map must be an array of numbers, got "):
+            takes_maps(values)
+    with pytest.raises(InputError, match="the picture must be an array of numbers, got "):
+        lit.adjoint(values)
 
 
 @pytest.mark.slow

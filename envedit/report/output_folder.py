@@ -92,11 +92,14 @@ def _runs(process):
 def alone(folder: Path) -> Iterator[None]:
     """Make a folder for results, and let no other process of this machine work in it meanwhile.
 
-    InputError if it cannot be made, or another process works in it.
+    What is made is removed again where nothing was written into it. InputError if it cannot be made, or
+    another process works in it.
     """
+    made: list[Path] = []
     try:
+        made += (path for path in (folder, *folder.parents) if not path.exists())
         if folder.exists() and not folder.is_dir():
-            raise InputError(f"{folder}: is a file, the results need a folder: give another with --out")
+            raise InputError(f"{folder}: is a file, the results need another folder")
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise _unusable(folder, error) from error
@@ -105,11 +108,14 @@ def alone(folder: Path) -> Iterator[None]:
         descriptor = os.open(folder, os.O_RDONLY)
     try:
         if descriptor is not None and not file_locks.lock(descriptor):
-            raise InputError(f"{folder}: another run works in it: wait, or give another --out")
+            raise InputError(f"{folder}: another run works in it: wait, or use another folder")
         yield
     finally:
         if descriptor is not None:
             os.close(descriptor)
+        with contextlib.suppress(OSError):  # something is in it
+            for path in made:
+                path.rmdir()
 
 
 def prepare_folder(
@@ -135,7 +141,7 @@ def prepare_folder(
         read = {os.path.realpath(path) for path in inputs} if old else set()
         read |= {os.path.dirname(path) for path in read}  # a result may be a folder
         if mine := [path for path in old if os.path.realpath(path) in read]:
-            raise InputError(f"{mine[0]}: this input lies where its own results would go: give another --out")
+            raise InputError(f"{mine[0]}: this input lies where its own results would go: use another folder")
 
         # ---- What is moved or copied
         if keep and {folder / names[0], folder / names[-1]} & set(old):
@@ -155,7 +161,7 @@ def prepare_folder(
     except OSError as error:
         raise _unusable(folder, error) from error
     if not os.access(folder, os.W_OK):
-        raise InputError(f"{folder}: cannot be written to: give another folder with --out")
+        raise InputError(f"{folder}: cannot be written to: use another folder")
 
 
 def _copied(path):
@@ -169,4 +175,4 @@ def _copied(path):
 
 def _unusable(folder, error):
     reason = f"{folder}: cannot be used for the results ({error.strerror or error})"
-    return InputError(f"{reason}: give another with --out")
+    return InputError(f"{reason}: use another folder")

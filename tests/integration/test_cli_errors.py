@@ -140,8 +140,17 @@ def test_an_output_folder_that_cannot_be_made_or_written_to(path, capsys, tmp_pa
     folders += [tmp_path / "locked"] * (getattr(os, "geteuid", int)() != 0)  # permissions do not bind root
     for folder in folders:
         said = fails(3, capsys, path, "--out", str(folder))
-        assert str(folder) in said and "--out" in said
+        assert str(folder) in said and "another folder" in said and "--out" not in said
     assert (tmp_path / "c_out").read_text() == "mine"
+
+
+def test_a_run_that_fails_leaves_no_empty_folder(path, capsys, tmp_path):
+    out = tmp_path / "new" / "folder"
+    fails(3, capsys, path, *changed(input__envmap="none.exr"), "--out", str(out))
+    assert not out.parent.exists()
+    out.mkdir(parents=True)
+    fails(3, capsys, path, *changed(input__envmap="none.exr"), "--out", str(out))
+    assert out.is_dir()  # it was there before
 
 
 # ---- the machine: 4 --------------------------------------------------------------------------------------

@@ -262,6 +262,15 @@ def test_a_light_with_an_orientation_keeps_it(tmp_path):
     assert "scene.up has no effect: the scene's sunsky has an orientation of its own" in notes
 
 
+def test_the_scene_s_own_file_is_known_by_another_path(tmp_path, rng):
+    images.write_exr(tmp_path / "own.exr", sky(rng) + 0.1)
+    (tmp_path / "maps").mkdir()
+    path = str(write_scene(tmp_path, PATH, SENSOR, BALL, light(800)))
+    lit = inputs.load_scene(config.Scene(file=path, width=16))
+    named = config.Input(envmap=f"{tmp_path}/maps/../own.exr", width=16)
+    assert inputs.notes(named, lit, inputs.read_map(named, lit)) == ["the scene multiplies it by scale 800"]
+
+
 @pytest.mark.slow
 def test_the_scale_of_the_scene_can_be_dropped(tmp_path, rng):
     images.write_exr(tmp_path / "own.exr", sky(rng) + 0.1)

@@ -28,7 +28,18 @@ def unused(config: Config, solver: str | None = None) -> list[str]:
                 found.setdefault(reason, []).append(f"{name}.{key}")
     if config.input.lights:  # they are placed by the horizon whatever the representation is
         found = {reason: [key for key in keys if key != "input.horizon"] for reason, keys in found.items()}
+    if soft := _soft_gaussians(config):
+        found['no effect: needs shape other than "gaussian"'] = soft
     return [f"{', '.join(keys)}: {reason}" for reason, keys in found.items() if keys]
+
+
+def _soft_gaussians(config: Config) -> list[str]:
+    """Name the ``softness`` of added lights that are Gaussian, whose border is always the same."""
+    return [
+        f"input.lights[{i}].softness"
+        for i, light in enumerate(config.input.lights)
+        if light.get("softness") and light.get("shape", "gaussian") == "gaussian"
+    ]
 
 
 def _reason(config: Config, when: When, solver: str | None) -> str:

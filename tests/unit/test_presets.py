@@ -122,6 +122,13 @@ def test_a_target_is_a_file_or_a_turn_and_the_last_one_given_counts():
         assert cleared.file == "" and cleared.rotate_degrees == "auto"
 
 
+def test_a_gaussian_light_has_no_softness():
+    added = {"azimuth": 90, "elevation": 30, "flux": [1, 1, 1]}
+    lights = [added | {"softness": 0.5}, added | {"softness": 0.5, "shape": "disc"}, added | {"softness": 0}]
+    (said,) = cfg.unused(cfg.Config(input={"lights": lights}))
+    assert said == 'input.lights[0].softness: no effect: needs shape other than "gaussian"'
+
+
 def test_paths_are_relative_to_the_file_and_names_that_are_no_paths_stay(tmp_path, here):
     folder = tmp_path / "project"
     folder.mkdir()

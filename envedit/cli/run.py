@@ -233,7 +233,7 @@ def _export_initial(settings, base, file, console):
 def _dry_run(settings, base, console):
     """Write what a run would edit towards, and nothing else: a picture to look at, and linear radiance."""
     doctor.select(settings.variant)
-    from envedit import inputs
+    from envedit import config, inputs
     from envedit.core.atomic_files import write_atomically
     from envedit.images import images
     from envedit.report import output_folder, preview
@@ -256,7 +256,8 @@ def _dry_run(settings, base, console):
         )
         write_atomically(picture_file, sheet)
         images.write_exr(radiance_file, target.picture, {"content": "target"}, panorama=False)
-    for line in (*input_map.warnings, *target.warnings):
+    solver = None if settings.newton else "adam"  # a mirror's detail is solved for by Adam, too
+    for line in (*input_map.warnings, *target.warnings, *config.unused(settings, solver)):
         console.warn(line)
     files = {file.name: str(file.resolve()) for file in (picture_file, radiance_file)}
     for line in (*inputs.notes(settings.input, scene, input_map), target.source, *files.values()):
@@ -300,7 +301,7 @@ def _verdict(measured):
     painted = measured["painted"]
     if painted:
         line = metrics.painted_verdict(painted)
-    elif not measured["iterations"] and measured["initial"]["log_rmse"] == 0:
+    elif not (measured["iterations"] or measured["envmap"] or measured["initial"]["log_rmse"]):
         measure = "log RMSE" if metrics.saturated([measured["render"]]) else "PSNR"
         score = metrics.score(measured["render"], [])
         line = f"no target; {measure} of the rendering against the initial one {score}"

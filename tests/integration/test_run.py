@@ -557,6 +557,14 @@ def test_strokes_that_paint_nothing_are_a_mistake_of_the_configuration(tmp_path,
     assert says.endswith("; target.strokes[1] (blur): opacity 0, nothing was painted")
 
 
+def test_a_map_that_its_turn_leaves_as_it_is_is_not_called_no_target(tmp_path, rng, capsys):
+    path = world(tmp_path, rng)
+    images.write_exr(tmp_path / "map.exr", np.zeros((8, 16, 3), np.float32))
+    assert call(path, *changed(target__file="", target__rotate_degrees=30.0)) == 0
+    out = capsys.readouterr().out
+    assert "bit for bit: nothing is solved" in out and "no target" not in out
+
+
 def test_a_dry_run_writes_the_target_and_nothing_else(tmp_path, rng, capsys):
     stroke = {"type": "light", "rectangle": [0, 0, 0.5, 1], "amount": 0.25, "color": "#ffffff"}
     path = world(tmp_path, rng, target={"kind": "strokes", "strokes": [stroke]})
@@ -564,6 +572,7 @@ def test_a_dry_run_writes_the_target_and_nothing_else(tmp_path, rng, capsys):
     assert call(path, "--export-initial", tmp_path / "initial.exr", "--quiet") == 0
     assert call(path, "--dry-run") == 0
     out, err = capsys.readouterr()
+    assert 'fit.epochs: no effect: needs representation.kind = "siren"' in err
     assert "1 stroke on the initial rendering" in out and "dry_run.png" in out
     after = content(tmp_path)
     made = {"initial.exr", "initial.exr.envedit.json", "c_out/dry_run.png", "c_out/dry_run.exr"}

@@ -16,7 +16,7 @@ import numpy as np
 
 from envedit import config, inputs, renderers
 from envedit.core import color
-from envedit.core.errors import NumericalError, unwrapped
+from envedit.core.errors import NumericalError, counted, unwrapped
 from envedit.core.radiance import BRIGHTEST
 from envedit.core.rows import Rows
 from envedit.core.seeds import Seeds
@@ -541,9 +541,10 @@ class _Edit:
         # ---- The solver
         solving = self.job.settings.optimizer.iterations > 0 and not measures["worse"]
         if solving and nothing:
+            steps = counted(state.step, "step", "steps")
             self.warnings.append(
-                f"the edit achieved nothing in {state.step} steps: {how}; check the target's exposure, and "
-                "that the map lights what is to change"
+                f"the edit achieved nothing in {steps}: {how}; check the target's exposure, and that the map "
+                "lights what is to change"
             )
         if state.bad_steps:
             self.warnings.append(

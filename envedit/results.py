@@ -12,7 +12,7 @@ import numpy as np
 
 from envedit import config, inputs
 from envedit.core import latlong
-from envedit.core.errors import ConfigError
+from envedit.core.errors import ConfigError, counted
 from envedit.core.extras import required
 from envedit.export import adjustments, file_resolution
 from envedit.losses import metrics
@@ -137,9 +137,10 @@ class Result:
         before, after = (self.metrics[name] for name in ("initial", "render"))
         if before["log_rmse"]:  # with a target
             first, last = (metrics.score(one, (before, after)) for one in (before, after))
-            parts.append(f"{first} before, {last} after {self.metrics['iterations']} steps")
+            steps = counted(self.metrics["iterations"], "step", "steps")
+            parts.append(f"{first} before, {last} after {steps}")
         if self.warnings:
-            parts.append(f"{len(self.warnings)} warning{'s' if len(self.warnings) > 1 else ''}")
+            parts.append(counted(len(self.warnings), "warning", "warnings"))
         return f"Result({', '.join(parts)})"
 
     def _repr_png_(self) -> bytes:

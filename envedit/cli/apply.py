@@ -7,7 +7,7 @@ from pathlib import Path
 
 from envedit.cli import doctor, map_command
 from envedit.core.atomic_files import make_folder
-from envedit.core.errors import ConfigError
+from envedit.core.errors import ConfigError, counted
 
 LOOK = ".toml"
 
@@ -68,7 +68,8 @@ def _amounts(arguments, names, maps):
     """Return the amounts of the maps that are written of each map."""
     amount, frames = arguments.amount, arguments.frames
     if not 1 <= len(names) <= 2 or not maps:
-        got = f"{len(names)} looks (.toml) and {len(maps)} maps"
+        found = counted(len(names), "look (.toml)", "looks (.toml)")
+        got = f"{found} and {counted(len(maps), 'map', 'maps')}"
         raise ConfigError(f"got {got}, expected one look, or two, and maps")
     if amount is not None and frames is not None:
         raise ConfigError("got --amount and --frames, expected one of them")

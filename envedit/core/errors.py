@@ -51,6 +51,15 @@ def place_of(bad: np.ndarray, first_row: int = 0) -> str:
     return f"row {first_row + row}, column {column}"
 
 
+def counted(count: int, one: str, many: str) -> str:
+    """Return a number with what it counts.
+
+    >>> counted(1, "texel is", "texels are")
+    '1 texel is'
+    """
+    return f"{count} {one if count == 1 else many}"
+
+
 @contextlib.contextmanager
 def unwrapped() -> Iterator[None]:
     """Raise errors that a user should see, and Ctrl-C, as they are; also a decorator.

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from envedit.core.errors import InputError, place_of
+from envedit.core.errors import InputError, counted, place_of
 from envedit.core.types import ArrayLike
 
 HALF_MAX = 65504.0
@@ -23,7 +23,8 @@ def any_channel(mask: np.ndarray) -> np.ndarray:
 def require_unmasked(values: ArrayLike, what: str) -> None:
     """Refuse a masked array of which something is masked, with an InputError: its mask would not be read."""
     if masked := int(np.count_nonzero(np.ma.getmask(values))):
-        raise InputError(f"{what}: {masked} values are masked, and masks are not read: fill them (ma.filled)")
+        values_are = counted(masked, "value is", "values are")
+        raise InputError(f"{what}: {values_are} masked, and masks are not read: fill them (ma.filled)")
 
 
 def require_radiance(image: ArrayLike, what: str, first_row: int = 0, brightest: float = math.inf) -> None:
@@ -41,9 +42,9 @@ def require_radiance(image: ArrayLike, what: str, first_row: int = 0, brightest:
         (image > brightest, f"brighter than {brightest:.3g}", "scale the map down"),
     ):
         if bad.any():
-            texels = any_channel(bad)
+            texels_are = counted(any_channel(bad).sum(), "texel is", "texels are")
             where = f"the first at {place_of(bad, first_row)}"
-            raise InputError(f"{what}: {texels.sum()} texels are {how}, {where}: {cure}")
+            raise InputError(f"{what}: {texels_are} {how}, {where}: {cure}")
 
 
 def repair(image: ArrayLike) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

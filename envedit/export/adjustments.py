@@ -12,7 +12,7 @@ import numpy as np
 
 from envedit import config
 from envedit.core import latlong
-from envedit.core.errors import NumericalError
+from envedit.core.errors import NumericalError, counted
 from envedit.core.rows import bands
 from envedit.representations.layers import file_lights
 from envedit.targets.strokes import balance, gains
@@ -149,9 +149,8 @@ def _soften(envmap, degrees, most):
     over = (envmap > most).any(axis=2)
     if over.any():
         lost = 100 * float(np.maximum(envmap[over] - most, 0).sum() / envmap.sum(dtype=np.float64))
-        notes.append(
-            f"{over.sum()} texels are still above max_radiance and are cut: {lost:.2g} % of the light"
-        )
+        texels_are = counted(over.sum(), "texel is", "texels are")
+        notes.append(f"{texels_are} still above max_radiance and cut: {lost:.2g} % of the light")
     np.minimum(envmap, np.float32(most), out=envmap)
     return notes
 

@@ -97,9 +97,9 @@ def read(name: str, head: bytes, info: Info, stored: bool) -> np.ndarray:
     windows = [_window(p.header["dataWindow"]) for p in parts]
     index, names = _choose_channels(name, [p.header for p in parts], info)
     header = parts[index].header
+    layer = names[0].rpartition(".")[0]
+    beside = [c for c in header["channels"] if c.name.rpartition(".")[0] == layer]
     if stored:
-        layer = names[0].rpartition(".")[0]
-        beside = [c for c in header["channels"] if c.name.rpartition(".")[0] == layer]
         alpha = [c for c in beside if c.name.rpartition(".")[2].upper() == "A"]
         names += [c.name for c in alpha if c.xSampling == c.ySampling == 1]
 
@@ -110,6 +110,7 @@ def read(name: str, head: bytes, info: Info, stored: bool) -> np.ndarray:
         planes = [np.array(decoded.channels[c].pixels, np.float32) for c in names]
     if any(p.shape != (height, width) for p in planes):
         raise damaged(name, "not all of its channels could be decoded")
+    info["unread"] = [c.name for c in beside if c.name not in names and not _opaque(decoded.channels[c.name])]
     display = _window(header["displayWindow"])
     if stored and len(planes) in (1, 3) and windows[index] != display:
         planes.append(np.ones_like(planes[0]))  # what lies outside the data is transparent, not black
@@ -239,6 +240,11 @@ def _choose_channels(name, headers, info):
     if any(c.xSampling != 1 or c.ySampling != 1 for c in headers[index]["channels"] if c.name in names):
         raise InputError(f"{name}: subsampled channels are not supported; save R, G, B in full")
     return index, names
+
+
+def _opaque(channel):
+    """Return whether a channel is alpha, and 1 everywhere."""
+    return channel.name.rpartition(".")[2].upper() == "A" and bool((channel.pixels == 1).all())
 
 
 def _rank(label):

@@ -15,10 +15,10 @@ import numpy as np
 
 from envedit.core import latlong, primaries, radiance
 from envedit.core.atomic_files import write_atomically
-from envedit.core.errors import ConfigError, EnveditError, InputError, place_of
+from envedit.core.errors import ConfigError, EnveditError, InputError, counted, place_of
 from envedit.core.types import ArrayLike, FilePath, Info
 from envedit.images import exr, ldr, marks, rgbe, tiff
-from envedit.images.headers import MAX_SIDE, damaged, finite, head_of
+from envedit.images.headers import MAX_SIDE, damaged, finite, head_of, shown
 
 FORMATS = (
     ("exr", b"\x76\x2f\x31\x01", exr.read),
@@ -182,7 +182,7 @@ def _repaired(image, info, repair):
     if not bad.any():
         return image
     if not repair:
-        where = f"{info['repaired']} texels are NaN or infinite, the first at {place_of(bad)}"
+        where = f"{_texels_are(bad)} NaN or infinite, the first at {place_of(bad)}"
         raise InputError(
             f"{name}: {where}; repair the map, or set input.repair = true (of commands on maps: --repair)"
         )
@@ -191,12 +191,17 @@ def _repaired(image, info, repair):
     except InputError as e:
         raise InputError(f"{name}: {e}") from None
     if overflowed.any():
-        where = f"{overflowed.sum()} texels are infinite, the first at {place_of(overflowed)}"
+        where = f"{_texels_are(overflowed)} infinite, the first at {place_of(overflowed)}"
         info["warnings"].append(f"{where}: taken for the brightest light, {image[overflowed].max():g}")
     if replaced.any():
-        where = f"{replaced.sum()} texels are NaN or -Inf, the first at {place_of(replaced)}"
+        where = f"{_texels_are(replaced)} NaN or -Inf, the first at {place_of(replaced)}"
         info["warnings"].append(f"{where}: replaced from their neighbours")
     return image
+
+
+def _texels_are(mask):
+    """Return how many texels of a mask (H, W) are set, as the begin of a sentence."""
+    return counted(mask.sum(), "texel is", "texels are")
 
 
 def _note_oddities(stored, image, info):
@@ -208,13 +213,16 @@ def _note_oddities(stored, image, info):
     if negative.any():
         least = stored[finite].min()
         where = f"the first at {place_of(negative)}"
-        warnings.append(f"{negative.sum()} texels are negative (down to {least:.3g}), {where}: set to 0")
+        warnings.append(f"{_texels_are(negative)} negative (down to {least:.3g}), {where}: set to 0")
     saturated = radiance.any_channel(stored == radiance.HALF_MAX)
     if saturated.any():
         warnings.append(
-            f"{saturated.sum()} texels sit at 65504, the largest half, the first at {place_of(saturated)}: "
+            f"{_texels_are(saturated)} at 65504, the largest half, the first at {place_of(saturated)}: "
             "the light was cut when the file was saved"
         )
+    if unread := info.get("unread"):
+        names = ", ".join(shown(channel, 30) for channel in unread[:6]) + (", ..." if len(unread) > 6 else "")
+        warnings.append(f"only its colours are read, not {names}")
     if not image.any():
         warnings.append("the map is black: it lights nothing")
 
@@ -288,7 +296,7 @@ def write_layers(
             raise ValueError(
                 f"{name}: layer '{layer}' has shape {values.shape}, expected {size} with 3 channels"
             )
-        values = finite(name, values, f"texels of layer '{layer}'")
+        values = finite(name, values, layer)
         prefix = "" if layer == default else f"{layer}."
         for i, channel in enumerate("RGB" if colour else "Y"):
             planes[prefix + channel] = values[..., i] if colour else values

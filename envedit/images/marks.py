@@ -17,6 +17,7 @@ import numpy as np
 
 from envedit.core import primaries
 from envedit.core.color import linear_to_srgb, srgb_to_linear
+from envedit.core.errors import counted
 from envedit.core.types import Info
 from envedit.images.headers import shown
 
@@ -74,8 +75,8 @@ def light(codes: np.ndarray, info: Info) -> np.ndarray:
     radiance = values[np.broadcast_to(codes[..., :colours], (*codes.shape[:2], 3))]
     if codes.shape[2] > colours and (codes[..., -1] < top).any():
         alpha = codes[..., -1:]
-        count = int((alpha < top).sum())
-        warnings.append(f"{count} texels are transparent: their light is multiplied by their opacity")
+        texels_are = counted((alpha < top).sum(), "texel is", "texels are")
+        warnings.append(f"{texels_are} transparent: light is multiplied by opacity")
         radiance *= (alpha / top).astype(np.float32)
     return radiance
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from envedit.core.color import luminance
 from envedit.core.color import tonemap as apply_tonemap
-from envedit.core.errors import InputError, place_of
+from envedit.core.errors import InputError, counted, place_of
 from envedit.core.types import ArrayLike, Views
 
 if TYPE_CHECKING:
@@ -49,7 +49,8 @@ def checked(image: ArrayLike, name: str) -> np.ndarray:
     bad = ~np.isfinite(image).all(axis=2)
     if bad.any():
         where = f"the first at {place_of(bad)}"
-        raise InputError(f"{name}: {bad.sum()} texel(s) are not finite, {where}; repair the image first.")
+        texels_are = counted(bad.sum(), "texel is", "texels are")
+        raise InputError(f"{name}: {texels_are} not finite, {where}; repair the image first.")
     return image
 
 

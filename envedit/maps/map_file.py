@@ -11,7 +11,7 @@ import numpy as np
 
 from envedit import config, inputs
 from envedit.core import primaries
-from envedit.core.errors import ConfigError
+from envedit.core.errors import ConfigError, counted
 from envedit.core.radiance import HALF_MAX
 from envedit.core.rows import bands
 from envedit.core.types import FilePath
@@ -126,8 +126,9 @@ def cut_to_half(values: np.ndarray, path: FilePath, remedy: str) -> tuple[np.nda
         return values, []
     excess = np.maximum(values[over] - HALF_MAX, 0).sum(dtype=np.float64)
     lost = 100 * float(excess / values.sum(dtype=np.float64))
+    texels_are = counted(over.sum(), "texel is", "texels are")
     warning = (
-        f"{os.fsdecode(path)}: {over.sum()} texels are brighter than {HALF_MAX:g}, the largest half, and are "
+        f"{os.fsdecode(path)}: {texels_are} brighter than {HALF_MAX:g}, the largest half, and "
         f"cut there: {lost:.2g} % of the sum of all texels is lost; {remedy}"
     )
     return np.minimum(values, np.float32(HALF_MAX)), [warning]

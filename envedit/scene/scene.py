@@ -36,7 +36,7 @@ import numpy as np
 from envedit.config.validators import meant
 from envedit.core import installed_plugins, latlong, shipped
 from envedit.core.color import tonemap
-from envedit.core.errors import ConfigError, EnveditError, InputError, NumericalError, place_of
+from envedit.core.errors import ConfigError, EnveditError, InputError, NumericalError, counted, place_of
 from envedit.core.quiet_libraries import quiet_libraries
 from envedit.core.radiance import require_unmasked
 from envedit.core.types import ArrayLike, FilePath
@@ -159,9 +159,9 @@ class Scene:
             image = image.astype(np.float32)
         if not (good := np.isfinite(image) & (image >= 0)).all():
             row, column, channel = np.argwhere(~good)[0]
-            bad = np.count_nonzero(~good.all(axis=2))
+            texels_are = counted(int((~good.all(axis=2)).sum()), "texel is", "texels are")
             raise NumericalError(
-                f"environment map: {bad} texels are not finite or are negative, "
+                f"environment map: {texels_are} not finite or negative, "
                 f"the first at row {row}, column {column}: {image[row, column, channel]} in {'RGB'[channel]}"
             )
         if not image[1:-1].any():  # Mitsuba's density has a factor sin(theta): it would sample nothing
@@ -247,8 +247,9 @@ class Scene:
         with np.errstate(over="ignore"):
             result = total.astype(np.float32)
         if (bad := ~np.isfinite(result).all(axis=2)).any():
+            pixels_are = counted(bad.sum(), "pixel is", "pixels are")
             raise NumericalError(
-                f"rendering of {self.path or 'the scene'}: {bad.sum()} pixels are not finite, "
+                f"rendering of {self.path or 'the scene'}: {pixels_are} not finite, "
                 f"the first at {place_of(bad)}; look for broken materials or too much light"
             )
         return result

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TextIO
 
 from envedit.core.atomic_files import make_folder, write_atomically
-from envedit.core.errors import ConfigError
+from envedit.core.errors import ConfigError, counted
 from envedit.core.extras import required
 from envedit.core.machine import cores
 from envedit.core.types import FilePath
@@ -75,7 +75,9 @@ def sweep(
 
     # ---- Carry it out
     if to_run:
-        done_before = f"{len(distinct)} jobs, {len(outcomes)} done before, {len(to_run)} to run"
+        done_before = (
+            f"{counted(len(distinct), 'job', 'jobs')}, {len(outcomes)} done before, {len(to_run)} to run"
+        )
         run = functools.partial(run_job, out=out)
         if scheduler is None:
             workers = min(workers or max(1, cores() // CORES_PER_JOB), len(to_run))
@@ -240,7 +242,7 @@ def table(outcomes: Sequence[Outcome]) -> str:
         lines.append(line.rstrip())
     states = [outcome.state for outcome in outcomes]
     counts = [f"{states.count(state)} {state}" for state in dict.fromkeys(states)]
-    return "\n".join([*lines, f"{len(outcomes)} jobs: {', '.join(counts)}"])
+    return "\n".join([*lines, f"{counted(len(outcomes), 'job', 'jobs')}: {', '.join(counts)}"])
 
 
 def _tsv(outcomes):

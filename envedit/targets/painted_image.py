@@ -13,7 +13,7 @@ from types import MappingProxyType
 import numpy as np
 
 from envedit.core.color import TONEMAPS, inverse_tonemap, tonemap
-from envedit.core.errors import InputError, place_of
+from envedit.core.errors import InputError, counted, place_of
 from envedit.core.resampling import fit
 from envedit.core.types import FilePath, Shape
 from envedit.images import images
@@ -90,8 +90,9 @@ def read(
     if (alpha < 1).any():
         values = _laid_over(values, alpha[..., None], before, info["hdr"])
         over = "laid over the initial rendering" if before is not None else "taken as it is"
+        pixels_are = counted((alpha == 0).sum(), "pixel is", "pixels are")
         warnings.append(
-            f"{file}: {(alpha == 0).sum()} pixels are transparent and count as not painted; "
+            f"{file}: {pixels_are} transparent, which counts as not painted; "
             f"the colour of {((alpha < 1) & (alpha > 0)).sum()} half transparent ones is {over}"
         )
     painted = alpha > 0
@@ -134,8 +135,9 @@ def _clipped_paint(file, excluded, coverage, whole):
         )
     if whole:
         return []
+    pixels_are = counted(uncounted.sum(), "painted pixel is", "painted pixels are")
     return [
-        f"{file}: {uncounted.sum()} painted pixels are clipped ('at least so bright') and left out; to "
+        f"{file}: {pixels_are} clipped ('at least so bright') and left out; to "
         "have them count, paint below white, or on an .exr"
     ]
 
@@ -271,7 +273,8 @@ def planes(file: FilePath, pixels: np.ndarray, warnings: list[str]) -> tuple[np.
         warnings.append(f"{file}: read as grey")
     if (negative := np.any(values < 0, axis=2)).any():
         where = f"the first at {place_of(negative)}"
-        warnings.append(f"{file}: {negative.sum()} pixels are negative, {where}: set to 0")
+        pixels_are = counted(negative.sum(), "pixel is", "pixels are")
+        warnings.append(f"{file}: {pixels_are} negative, {where}: set to 0")
     return np.maximum(values, 0), alpha, top
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from envedit import config, inputs
 from envedit.core import extensions, latlong
 from envedit.core.color import tonemap as apply_tonemap
-from envedit.core.errors import ConfigError, InputError
+from envedit.core.errors import ConfigError, InputError, counted
 from envedit.core.radiance import BRIGHTEST, require_radiance
 from envedit.core.seeds import Seeds
 from envedit.images import images
@@ -191,7 +191,8 @@ def _of_paint(settings, scene, envmap, picture, mask, hidden):
     if over := int((picture > BRIGHTEST).any(axis=2).sum()):
         # Squares and sums of what is more would leave single precision; on a display it is as white.
         picture = np.minimum(picture, np.float32(BRIGHTEST))
-        warnings += (f"target: {over} pixels are brighter than {BRIGHTEST:.3g}: they count as that bright",)
+        pixels_are = counted(over, "pixel is", "pixels are")
+        warnings += (f"target: {pixels_are} brighter than {BRIGHTEST:.3g}: taken as that bright",)
 
     # ---- How much each pixel counts
     coverage = np.where(hidden[..., None], 0, painted.coverage)

@@ -32,7 +32,7 @@ from envedit import config
 from envedit.core import latlong, seeds
 from envedit.core.array_cache import DiskCache, holds
 from envedit.core.arrays import tensor
-from envedit.core.errors import ConfigError, InputError
+from envedit.core.errors import ConfigError, InputError, counted
 from envedit.core.radiance import require_radiance, require_unmasked
 from envedit.core.types import ArrayLike, Progress
 from envedit.scene import built_scene
@@ -274,8 +274,8 @@ class LightTransport:
         count = self._lost + self._exact.lost
         if not count:
             return list(self._choices)
-        lost = f"light transport: {count} contributions of camera paths were not finite and are left out"
-        return [*self._choices, lost]
+        lost = counted(count, "contribution of a camera path", "contributions of camera paths")
+        return [*self._choices, f"light transport: left out as not finite: {lost}"]
 
     @property
     def columns(self) -> np.ndarray:

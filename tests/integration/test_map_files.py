@@ -146,7 +146,7 @@ def test_half_is_cut_at_its_largest_and_says_so(tmp_path, rng):
     np.testing.assert_allclose(
         pixels(tmp_path / "edited.exr"), np.minimum(image, 65504), rtol=2**-11, atol=1e-7
     )
-    assert "1 texels are brighter than 65504" in said[0]
+    assert "1 texel is brighter than 65504" in said[0]
 
 
 @pytest.mark.slow

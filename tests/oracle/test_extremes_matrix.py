@@ -79,7 +79,7 @@ def test_rows_of_a_refusal_are_those_of_the_map():
 def test_pixels_hold_what_logarithms_cannot():
     m = extremes.texel(3e38)
     np.testing.assert_array_equal(Pixels().decode(Pixels().encode(m)).numpy(), m)
-    with pytest.raises(InputError, match="log-pixels: 1 texels are brighter"):
+    with pytest.raises(InputError, match="log-pixels: 1 texel is brighter"):
         LogPixels().encode(m)
 
 
@@ -88,7 +88,7 @@ def test_whole_runs_end_finite_or_with_a_reason(tmp_path):
     m = extremes.sky(8, 16)
     asked = {"target": {"rotate_degrees": 90.0}, "input": {"rows": "all"}}
     m[2, 5] = 3e38
-    with pytest.raises(InputError, match="layers: 1 texels are brighter than 1.27e[+]30, .* row 2, column 5"):
+    with pytest.raises(InputError, match="layers: 1 texel is brighter than 1.27e[+]30, .* row 2, column 5"):
         pipeline.run(settings_of(tmp_path, m, **asked))
     m[2, 5] = 1e30
     result = pipeline.run(settings_of(tmp_path, m, **asked))
@@ -103,7 +103,7 @@ def test_a_picture_beyond_all_light_counts_as_bright_as_can_be(tmp_path):
     picture = initial_rendering.initial(lit, m, settings)
     picture[3, 4] = 3e38
     made = target.make(settings, lit, m, picture)
-    assert any("target: 1 pixels are brighter than 1.27e+30" in line for line in made.warnings)
+    assert any("target: 1 pixel is brighter than 1.27e+30" in line for line in made.warnings)
     assert (made.picture[3, 4] == np.float32(2.0**100)).all()
     picture[3, 4] = 1e30
     made = target.make(settings, lit, m, picture)
@@ -134,7 +134,7 @@ def test_a_light_of_any_radiance_comes_back(value):
 @pytest.mark.slow
 @pytest.mark.parametrize("value", [np.nan, np.inf, -5.0])
 def test_no_error_is_told_of_a_map_that_is_no_radiance(value):
-    with pytest.raises(InputError, match="light transport: 1 texels are .* row 5, column 9"):
+    with pytest.raises(InputError, match="light transport: 1 texel is .* row 5, column 9"):
         transport(16, 32).coarse_error(extremes.texel(value))
 
 

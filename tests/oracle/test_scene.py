@@ -151,7 +151,7 @@ def test_extreme_maps_render_in_proportion(loaded, value):
 def test_a_bad_texel_is_named_and_not_rendered(loaded, value):
     image = np.ones((8, 16, 3))
     image[3, 5, 1] = value
-    with pytest.raises(NumericalError, match=r"1 texels .* row 3, column 5: \S+ in G"):
+    with pytest.raises(NumericalError, match=r"1 texel .* row 3, column 5: \S+ in G"):
         loaded.render(image)
 
 

@@ -68,14 +68,14 @@ def _declare():
     for name in NOT_FINITE:
         cells[name, "read"] = refused(
             InputError,
-            f"1 texels are NaN or infinite, {AT}; repair the map",
+            f"1 texel is NaN or infinite, {AT}; repair the map",
             "`[input] repair = true` takes the mean of its neighbours instead, "
             "or the brightest light for +Inf.",
         )
         cells[name, "normalise"] = seen(
             "range", "The range is not finite; every representation refuses the map before."
         )
-        wrong = refused(InputError, f"1 texels are not finite, {AT}: repair the map")
+        wrong = refused(InputError, f"1 texel is not finite, {AT}: repair the map")
         cells[name, "fit"] = cells[name, "edit loop"] = wrong
         cells[name, "transport"] = seen(
             "picture, adjoint",
@@ -88,10 +88,8 @@ def _declare():
         cells[name, "Adam"] = seen(
             "step", "The step is refused as a whole: no parameter and no moment changes."
         )
-        cells[name, "write"] = refused(NumericalError, f"not written: 1 texels are not finite, {AT}")
-        cells[name, "metrics"] = refused(
-            InputError, f"1 texel(s) are not finite, {AT}; repair the image first"
-        )
+        cells[name, "write"] = refused(NumericalError, f"not written: 1 texel is not finite, {AT}")
+        cells[name, "metrics"] = refused(InputError, f"1 texel is not finite, {AT}; repair the image first")
     for name, count, first in (("-5", 1, AT), ("all negative", 512, "the first at row 0, column 0")):
         cells[name, "normalise"] = cells["NaN", "normalise"]
         wrong = refused(InputError, f"{count} texels are negative, {first}: set them to 0")
@@ -109,7 +107,7 @@ def _declare():
         "Where a pixel is dark beside such a light, the gradient of the light's place has no square in "
         "single precision: an edit then stops after 20 steps that are refused, with a `NumericalError`.",
     )
-    bright = refused(InputError, f"1 texels are brighter than 1.27e+30, {AT}: scale the map down")
+    bright = refused(InputError, f"1 texel is brighter than 1.27e+30, {AT}: scale the map down")
     cells["3e38", "fit"] = cells["3e38", "edit loop"] = bright
     cells["3e38", "normalise"] = Outcome(
         "done",

@@ -41,10 +41,16 @@ def test_load_envmap(tmp_path, rng):
     found, info = images.load_envmap(path)
     np.testing.assert_array_equal(found, np.maximum(stacked(p), 0))
     assert info["clipped"] == 1 and info["repaired"] == 0
-    assert info["warnings"][0] == "1 texels are negative (down to -2), the first at row 3, column 4: set to 0"
+    assert info["warnings"][0] == "1 texel is negative (down to -2), the first at row 3, column 4: set to 0"
     assert "65504" in info["warnings"][1] and len(info["warnings"]) == 2
     assert images.load_envmap(path, width=8)[0].shape == (4, 8, 3)
     assert "enlarged from 16 to 64" in images.load_envmap(path, width=64)[1]["warnings"][-1]
+
+    beside = {"A": np.full((8, 16), 0.5, np.float32), "Z": p["R"]}
+    path = exr(tmp_path / "alpha.exr", **p, **beside)
+    assert images.load_envmap(path)[1]["warnings"][-1] == "only its colours are read, not A, Z"
+    path = exr(tmp_path / "opaque.exr", **p, A=np.ones((8, 16), np.float32))
+    assert len(images.load_envmap(path)[1]["warnings"]) == 2
 
     p["R"][5, 6], p["R"][5, 2] = np.nan, np.inf
     path = exr(tmp_path / "a.exr", **p)
@@ -124,7 +130,7 @@ def test_write_exr_round_trip(tmp_path, rng):
 def test_non_finite_values_reach_no_file(tmp_path, bad, writer):
     values = np.zeros((4, 8, 3))
     values[2, 5, 1] = bad
-    with pytest.raises(NumericalError, match=r"o.x: not written: 1 texels .* row 2, column 5"):
+    with pytest.raises(NumericalError, match=r"o.x: not written: 1 texel .* row 2, column 5"):
         writer(tmp_path / "o.x", values)
     assert not os.listdir(tmp_path)
 

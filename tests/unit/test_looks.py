@@ -164,7 +164,7 @@ def test_the_command_writes_maps_of_the_files_own_size_and_format(tmp_path, here
     frames = [images.read(f"frames/a_{i:04d}.exr")[0] for i in (1, 2)]
     assert np.array_equal(frames[0], images.read("a.exr")[0]) and not np.allclose(*frames)
     for wrong, message in (
-        (["evening.toml"], "got 1 looks (.toml) and 0 maps"),
+        (["evening.toml"], "got 1 look (.toml) and 0 maps"),
         (["evening.toml", "evening.toml", "a.exr"], "got two looks: say where between them"),
         (["none.toml", "a.exr", "--out", "other"], "none.toml: No such file"),
         (["evening.toml", "none.exr", "--out", "other"], "none.exr: no such file"),

@@ -40,11 +40,11 @@ def test_what_a_file_cannot_hold_is_cut_and_reported_or_reaches_no_file(sky, tmp
     brighter = read.stored.copy()
     brighter[2, 3] = 1e6
     (warning,) = map_file.write(tmp_path / "b.exr", brighter, read)
-    assert "1 texels are brighter than 65504" in warning
+    assert "1 texel is brighter than 65504" in warning
     assert map_file.read(tmp_path / "b.exr").stored.max() == 65504
     sky[1, 1, 1] = np.nan
     for name in ("c.exr", "c.hdr"):
-        with pytest.raises(NumericalError, match="1 texels are not finite, the first at row 1, column 1"):
+        with pytest.raises(NumericalError, match="1 texel is not finite, the first at row 1, column 1"):
             map_file.write(tmp_path / name, sky)
         assert not (tmp_path / name).exists()
 

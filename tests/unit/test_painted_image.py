@@ -499,7 +499,7 @@ def test_negative_values_are_set_to_zero(initial, tmp_path):
     wanted[7, 11] = [-0.5, 1, 1]
     found = painted_image.read(floats(tmp_path / "p.exr", wanted), SIZE, "gamma", initial)
     np.testing.assert_array_equal(found.picture[7, 11], [0, 1, 1])
-    assert "1 pixels are negative, the first at row 7, column 11" in told(found)
+    assert "1 pixel is negative, the first at row 7, column 11" in told(found)
 
 
 # ---- masks -------------------------------------------------------------------------------------------------

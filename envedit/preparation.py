@@ -241,7 +241,9 @@ class Preparation:
             with self.clock("start_s"):
                 params, run = self._explained(layers, octaves, notes, recordings.transport)
             layers.params = params
+            detailed = bool(octaves)
             octaves = octaves and self._finer(job, params, recordings, notes)
+            layers.coarse = detailed and not octaves
             if job.newton and not octaves:
                 layers.begun = run
 

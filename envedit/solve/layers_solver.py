@@ -53,6 +53,8 @@ class LayersSolver:
     # How well the target determines the sky, once :meth:`optimise` knows it
     posterior: Posterior | None = None
     note: str = ""  # what a user should know of the solution
+    # Whether :attr:`params` are a solution on coarse grids that explains the target; it is kept
+    coarse: bool = False
     _likelier: list[str] = field(default_factory=list)
     _curves: dict[str, float] = field(default_factory=dict)
 
@@ -174,7 +176,9 @@ class LayersSolver:
         return settled or self._another(solution, interrupt) or self._corrected(solution)
 
     def _notes(self, solution):
-        notes = [solution.note] if solution.note else list(self._likelier)
+        notes = list(self._likelier)
+        if solution.note:
+            notes = [] if self.coarse else [solution.note]
         run = solution.run
         if run.hold > 1:
             notes.append(hold.said(run.hold, self._changed_rest(run)))

@@ -503,6 +503,7 @@ def test_a_mirror_gets_no_finer_grids_where_coarse_ones_explain_the_target(tmp_p
     brighter = pipeline.run(settings)
     assert any("identifiable detail: " in note and "24 cycles" in note for note in brighter.notes)
     assert any("coarse grids explain the target" in note for note in brighter.notes)
+    assert not any("kept the initialisation" in note for note in brighter.notes)
     assert len([name for name in brighter.found.params if name.startswith("gain.")]) == gain.LEVELS
     seen = brighter.influence > np.median(brighter.influence)
     assert np.median(brighter.envmap[seen] / picture[seen]) == pytest.approx(1.3, abs=0.05)

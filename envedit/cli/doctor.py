@@ -32,7 +32,7 @@ from typing import Any
 
 from envedit.cli.console import make_parser
 from envedit.cli.streams import steady
-from envedit.core import machine
+from envedit.core import interrupts, machine
 from envedit.core.atomic_files import opened, write_atomically
 from envedit.core.errors import InputError, MachineError
 
@@ -151,9 +151,9 @@ def ensure(variant: str = "llvm_ad_rgb") -> None:
 def select(variant: str = "llvm_ad_rgb") -> None:
     """Select a variant of Mitsuba, as quiet as a command is, if :func:`ensure` finds that it works here."""
     ensure(variant)
+    interrupts.import_mitsuba(variant)
     import mitsuba as mi
 
-    mi.set_variant(variant)
     mi.set_log_level(mi.LogLevel.Error)
 
 

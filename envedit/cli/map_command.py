@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING
 
 from envedit.cli import console
 from envedit.cli.console import Console
+from envedit.core import interrupts
 from envedit.core.errors import MachineError
 
 if TYPE_CHECKING:
@@ -82,6 +83,7 @@ def run(
     terminal = Console(one_object=arguments.json)
 
     def carry_out():
+        interrupts.import_mitsuba()
         try:
             action(arguments, terminal)
         except MemoryError:

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 from envedit.cli import doctor, run_options
 from envedit.cli.console import Console, exit_code
 from envedit.cli.streams import steady
-from envedit.core import shipped
+from envedit.core import interrupts, shipped
 from envedit.core.errors import ConfigError, InputError
 
 if TYPE_CHECKING:
@@ -101,6 +101,7 @@ def _run(arguments, console, begun):
         return _dry_run(settings, base, console)
 
     # ---- The edit
+    interrupts.import_mitsuba()
     folder = Path(settings.output.dir)
     with output_folder.alone(folder):
         read = output_folder.inputs_of(settings, base)

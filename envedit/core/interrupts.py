@@ -26,3 +26,14 @@ def ctrl_c() -> Iterator[threading.Event]:
         yield event
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+def import_mitsuba(variant: str | None = None) -> None:
+    """Import Mitsuba, and select a variant; Ctrl-C waits: it would leave modules half initialised."""
+    with ctrl_c() as interrupt:
+        import mitsuba as mi
+
+        if variant is not None:
+            mi.set_variant(variant)
+    if interrupt.is_set():
+        raise KeyboardInterrupt

@@ -505,6 +505,35 @@ def test_interrupted_and_killed_processes_resume_to_the_same_bits(tmp_path, rng)
     assert names(out) == FILES | INFLUENCE and len(rows_of(out)) == 150
 
 
+INTERRUPTED_IMPORT = """
+import os, signal, sys
+
+
+class Interrupting:
+    def find_spec(self, name, path=None, target=None):
+        if name == "mitsuba.python.ad":
+            sys.meta_path.remove(self)
+            os.kill(os.getpid(), signal.SIGINT)
+
+
+sys.meta_path.insert(0, Interrupting())
+from envedit.cli.main import main
+
+sys.exit(main())
+"""
+
+
+@pytest.mark.slow
+def test_ctrl_c_while_mitsuba_is_imported(tmp_path, rng):
+    images.write_exr(tmp_path / "sky.exr", sky(rng))
+    for arguments in (["run", str(world(tmp_path, rng))], ["lights", str(tmp_path / "sky.exr")]):
+        command = [sys.executable, "-c", INTERRUPTED_IMPORT, *arguments]
+        found = subprocess.run(
+            command, cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(ROOT)}, capture_output=True, text=True
+        )
+        assert found.returncode == 130 and len(found.stderr.splitlines()) == 1, found.stderr
+
+
 # ---- other commands --------------------------------------------------------------------------------------
 
 

@@ -190,6 +190,7 @@ class Progress:
         self._stream = stream
         self._begun = time.monotonic()
         self._ended = 0
+        self._carried_out = 0  # of those that ended: not those that were done before
         self._failed = 0
         self._said: set[str] = set()
 
@@ -201,6 +202,7 @@ class Progress:
         self._ended += 1
         line = f"[{self._ended}/{self._total}] {outcome.job.name}: {outcome.state}"
         if outcome.state in ("done", "failed"):
+            self._carried_out += 1
             line += f", {outcome.seconds:.0f} s"
         if outcome.error:
             line += f": {outcome.error}"
@@ -208,8 +210,8 @@ class Progress:
             self._failed += 1
             line += f" ({outcome.job.folder(out) / LOG})"
         remarks = [f"{self._failed} failed"] if self._failed else []
-        if self._ended < self._total:
-            left = (self._total - self._ended) * (time.monotonic() - self._begun) / self._ended
+        if self._carried_out and self._ended < self._total:
+            left = (self._total - self._ended) * (time.monotonic() - self._begun) / self._carried_out
             until = time.strftime("%H:%M", time.localtime(time.time() + left))
             remarks.append(f"about {_duration(left)} left, until {until}")
         self.say(f"{line}; {', '.join(remarks)}" if remarks else line)

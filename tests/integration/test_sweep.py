@@ -515,13 +515,15 @@ def test_usage(wrong, tmp_path, capsys):
 def test_lines_tell_when_it_ends(tmp_path, monkeypatch):
     now, said = [0.0], io.StringIO()
     monkeypatch.setattr(drive.time, "monotonic", lambda: now[0])
-    progress = drive.Progress(4, said)
+    progress = drive.Progress(5, said)
+    progress.report(Outcome(job("j", "seed = 1"), "skipped", 0), tmp_path)
     for at, state, seconds in ((40, "done", 40), (400, "failed", 360), (400, "skipped", 0), (400, "done", 8)):
         now[0] = at
         progress.report(Outcome(job("j", "seed = 1"), state, seconds), tmp_path)
-    lines = said.getvalue().splitlines()
+    none_carried_out, *lines = said.getvalue().splitlines()
+    assert "left" not in none_carried_out
     assert "about 2 min left" in lines[0] and "1 failed, about 7 min left" in lines[1]
-    assert "about 2 min left" in lines[2] and "left" not in lines[3]
+    assert "about 3 min left" in lines[2] and "left" not in lines[3]
 
 
 # ---- the real run ------------------------------------------------------------------------------------------

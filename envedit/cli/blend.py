@@ -40,6 +40,8 @@ def _blend(arguments, console):
     first = map_command.read(arguments.first, arguments, console)
     second = map_command.read(arguments.second, arguments, console)
     alike = first.chromaticities == second.chromaticities and first.size == second.size
+    if first.size != second.size and arguments.amount != 0:
+        console.warn(f"{arguments.second}: resampled from {second.size[0]} to {first.size[0]} texels across")
     lights: list[dict] = []
     if arguments.amount == 0:
         values = first.stored

@@ -222,7 +222,7 @@ def _note_oddities(stored, image, info):
         )
     if unread := info.get("unread"):
         names = ", ".join(shown(channel, 30) for channel in unread[:6]) + (", ..." if len(unread) > 6 else "")
-        warnings.append(f"only its colours are read, not {names}")
+        warnings.append(f"channels of the map beside its colours are not read: {names}")
     if not image.any():
         warnings.append("the map is black: it lights nothing")
 

@@ -48,7 +48,8 @@ def test_load_envmap(tmp_path, rng):
 
     beside = {"A": np.full((8, 16), 0.5, np.float32), "Z": p["R"]}
     path = exr(tmp_path / "alpha.exr", **p, **beside)
-    assert images.load_envmap(path)[1]["warnings"][-1] == "only its colours are read, not A, Z"
+    said = images.load_envmap(path)[1]["warnings"][-1]
+    assert said == "channels of the map beside its colours are not read: A, Z"
     path = exr(tmp_path / "opaque.exr", **p, A=np.ones((8, 16), np.float32))
     assert len(images.load_envmap(path)[1]["warnings"]) == 2
 

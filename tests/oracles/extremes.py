@@ -90,9 +90,13 @@ def _declare():
         )
         cells[name, "write"] = refused(NumericalError, f"not written: 1 texel is not finite, {AT}")
         cells[name, "metrics"] = refused(InputError, f"1 texel is not finite, {AT}; repair the image first")
-    for name, count, first in (("-5", 1, AT), ("all negative", 512, "the first at row 0, column 0")):
+    first_of_all = "the first at row 0, column 0"
+    for name, texels_are, first in (
+        ("-5", "1 texel is", AT),
+        ("all negative", "512 texels are", first_of_all),
+    ):
         cells[name, "normalise"] = cells["NaN", "normalise"]
-        wrong = refused(InputError, f"{count} texels are negative, {first}: set them to 0")
+        wrong = refused(InputError, f"{texels_are} negative, {first}: set them to 0")
         cells[name, "fit"] = cells[name, "edit loop"] = wrong
         cells[name, "losses"] = seen(
             "change, log_mse, log_ssim", "Losses of a logarithm; all others are right."

@@ -59,7 +59,7 @@ def test_earlier_results_are_moved_and_the_map_is_not_overwritten(tmp_path, rng,
     assert {path.name for path in (out / "earlier-1").iterdir()} == {"fit.json", "fitted.exr", "preview.png"}
     images.write_exr(out / "fitted.exr", sky(rng))  # somebody's map by that name
     before = (out / "fitted.exr").read_bytes()
-    assert call(out / "fitted.exr", out) == 3 and "--out" in capsys.readouterr().err
+    assert call(out / "fitted.exr", out) == 3 and "another folder" in capsys.readouterr().err
     assert (out / "fitted.exr").read_bytes() == before
 
 

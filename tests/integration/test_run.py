@@ -363,7 +363,7 @@ def test_an_input_is_not_moved_away_with_earlier_results_by_any_name(tmp_path, r
         capsys.readouterr()
         assert call(path, "--quiet", *changed(input__envmap=str(folder / "edited.exr"))) == 3
         said = capsys.readouterr().err
-        assert len(said.splitlines()) == 1 and "edited.exr" in said and "--out" in said
+        assert len(said.splitlines()) == 1 and "edited.exr" in said and "another folder" in said
         assert content(out) == before
 
 

@@ -103,6 +103,13 @@ class Likelihood:
         return self.paint_noise is None
 
     @property
+    def asked(self) -> float:
+        """Share of the picture that the target is about: all of a rendering, of paint what it covers."""
+        if self.rest is None:
+            return 1.0
+        return 1 - float(self.rest.sum(dtype=np.float64)) / np.count_nonzero(self.weight)
+
+    @property
     def area(self) -> float:
         """Pixels whose errors go together, A; at least one."""
         return max(1.0, self.weight.size / self.independent)

@@ -109,10 +109,10 @@ class Prior:
 def of_paint(freedom: float, coverage: np.ndarray | None = None) -> Prior:
     """Return the prior of painted targets, of a freedom in units of how photographed skies differ.
 
-    Paint that asks for another brightness is no reason for another colour of a light: a third of what a
-    rendered target may change. One factor for the whole sky is as free as the picture is painted:
-    ``coverage`` (h, w, 1) is how much each pixel was, None: nothing.
+    One factor for the whole sky is as free as the picture is painted: ``coverage`` (h, w, 1) is how much each
+    pixel was, None: nothing. The colour of a light changes as that factor's.
     """
     painted = 0.0 if coverage is None else float(coverage.mean(dtype=np.float64))
     factor = max(LEAST_WHOLE_FREEDOM, freedom, painted)
-    return Prior(tint=Prior.tint / 3, flux_chroma=Prior.chroma / 3, freedom=freedom, factor=factor)
+    _, chroma, tint = (factor * skies.whole for skies in PHOTOGRAPHED)
+    return Prior(tint=tint, flux_chroma=chroma, freedom=freedom, factor=factor)

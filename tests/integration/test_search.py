@@ -233,6 +233,19 @@ def test_paint_that_one_factor_makes_leaves_lights(factor, transport):
     assert shown == pytest.approx(factor, rel=0.1)
 
 
+def test_paint_that_grades_all_of_the_picture_leaves_lights_and_changes_their_colour(transport):
+    """Bluer and darker: where lights are is asked about as of a rendering, and the sun is part of the map."""
+    image = sky(SUN)
+    before = rendered(transport, image)
+    grade = np.float32([0.3, 0.55, 1.0])
+    coverage = np.ones((PIXELS, PIXELS, 1), np.float32)
+    problem, start = problem_of(transport, image, grade * before, coverage, of_paint(FREEDOM, coverage))
+    found, lights, _, _ = found_for(problem, start)
+    assert found.name == "lights left where they are" and angle(lights[0], DIRECTIONS[SUN]) < 3
+    log_flux = found.run.state["flux"][0]
+    assert log_flux[2] - log_flux[0] == pytest.approx(np.log(grade[2] / grade[0]), rel=0.3)
+
+
 def test_a_map_that_is_not_finite_has_no_explanation(transport):
     """The search returns it as it is; the steps refuse it."""
     problem, start = moved(transport, ELSEWHERE)

@@ -67,13 +67,12 @@ def opened(work: Path):
     from playwright.sync_api import sync_playwright
 
     file = os.environ.get("CHROMIUM") or shutil.which("chromium") or shutil.which("google-chrome")
-    gl = ["--no-sandbox", "--enable-unsafe-swiftshader"]  # WebGL by software
     command = [sys.executable, "-m", "envedit", "paint", "edit.toml", "--no-browser", "--port", "0"]
     own = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
     pipe = subprocess.PIPE
     with (
         sync_playwright() as playwright,
-        playwright.chromium.launch(executable_path=file, args=gl) as browser,
+        playwright.chromium.launch(executable_path=file, args=["--no-sandbox"]) as browser,
         open(work / "server.log", "a") as log,
         subprocess.Popen(command, cwd=work, env=own, stdout=pipe, stderr=log, text=True) as process,
     ):

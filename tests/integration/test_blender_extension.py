@@ -23,9 +23,8 @@ BROWSER = """
 import sys
 from playwright import sync_api
 
-gl = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 with sync_api.sync_playwright() as playwright:
-    browser = playwright.chromium.launch(executable_path="CHROMIUM", args=["--no-sandbox", *gl])
+    browser = playwright.chromium.launch(executable_path="CHROMIUM", args=["--no-sandbox"])
     page = browser.new_page(viewport={"width": 1280, "height": 720})
     page.set_default_timeout(120_000)
     page.goto(sys.argv[1])

@@ -9,10 +9,10 @@ const THUMB = 48; // pixels high
 const NAMES = { strokes: "strokes", lights: "lights", regions: "regions of the map", rotate_degrees: "turn of the sky", tilt_degrees: "tilt", horizon_degrees: "horizon", exposure: "map exposure", temperature: "map temperature", rest: "the rest", freedom: "the sky may change" };
 
 export class Compare {
-  constructor(frames, displays, history, plain, on) {
+  constructor(frames, displays, history, on) {
     Object.assign(this, { frames, displays, history, on, kept: null, thumbs: new WeakMap(), drawn: [], asked: false }); // on: view(), send(message)
-    displays.sky = new Display($("sky"), "radiance", plain);
-    this.zoom = new Zoom($("sky").parentElement, () => displays.sky.draw());
+    displays.sky = new Display($("sky"), "radiance");
+    this.zoom = new Zoom($("sky").parentElement);
     $("keep-a").addEventListener("click", () => this.keep());
     $("back-a").addEventListener("click", () => history.push(this.kept.document));
     $("reference").addEventListener("change", () => this.show());

@@ -3,7 +3,7 @@
 import { Chooser } from "./chooser.js";
 import { Compare } from "./compare.js";
 import { Connection } from "./connection.js";
-import { accelerated, Display } from "./display.js";
+import { Display } from "./display.js";
 import { EMPTY, History } from "./history.js";
 import { Level } from "./level.js";
 import { LightList } from "./light_list.js";
@@ -13,13 +13,11 @@ import { Strokes } from "./strokes.js";
 import { Zoom } from "./zoom.js";
 
 const $ = (id) => document.getElementById(id);
-const canvas = new URLSearchParams(location.search).get("canvas"); // "2d" or "webgl2": as it is asked for
-const plain = canvas === "2d" || (canvas !== "webgl2" && !accelerated());
 const displays = {
-  render: new Display($("render"), "radiance", plain),
-  map: new Display($("map"), "radiance", plain),
-  difference: new Display($("difference"), "signed", plain),
-  unreachable: new Display($("unreachable"), "values", plain),
+  render: new Display($("render"), "radiance"),
+  map: new Display($("map"), "radiance"),
+  difference: new Display($("difference"), "signed"),
+  unreachable: new Display($("unreachable"), "values"),
 };
 const WORDS = { moving: "Moving", solving: "Solving", rendering: "Rendering", done: "Done" };
 const NAMES = { transport: "live", mitsuba: "path traced", saved: "saved" };
@@ -48,9 +46,9 @@ const history = new History((phase, document) => {
   refresh();
 });
 
-const compare = new Compare(frames, displays, history, plain, { view: () => view, send: (message) => connection.send(message) });
+const compare = new Compare(frames, displays, history, { view: () => view, send: (message) => connection.send(message) });
+const redraw = () => strokes.draw();
 const zooms = [new Zoom($("render").parentElement, redraw, () => strokes.cancel()), new Zoom($("map-stack"), redraw, () => regions.cancel())];
-function redraw() { displays.render.draw(); displays.map.draw(); strokes.draw(); }
 
 function send(document, phase) {
   waiting = { document, phase };
@@ -107,7 +105,7 @@ let explanations = []; // their displays
 function explain(message) {
   $("explanations").hidden = !message.explanations.length;
   if (!message.explanations.length) frames.explanation = [];
-  explanations = message.explanations.map(() => new Display(document.createElement("canvas"), "radiance", true));
+  explanations = message.explanations.map(() => new Display(document.createElement("canvas"), "radiance"));
   $("explanations").replaceChildren(...message.explanations.map(({ name, reached }, i) => {
     const button = document.createElement("button");
     button.dataset.testid = `explanation-${i}`;
@@ -589,8 +587,7 @@ window.addEventListener("keydown", (event) => {
 window.addEventListener("keyup", (event) => {
   if (event.key.toLowerCase() === "b") displays.render.set({ split: Number($("split").value) });
 });
-$("details").addEventListener("toggle", () => { displays.difference.draw(); displays.unreachable.draw(); });
-window.addEventListener("resize", () => { for (const one of Object.values(displays)) one.draw(); strokes.draw(); });
+window.addEventListener("resize", () => strokes.draw());
 
 // ---- start page
 

@@ -3,7 +3,7 @@
 const MOST = 8;
 
 export class Zoom {
-  constructor(inner, changed, pinched = () => {}) {
+  constructor(inner, changed = () => {}, pinched = () => {}) {
     Object.assign(this, { inner, changed, pinched, scale: 1, x: 0, y: 0, fingers: new Map() });
     const holder = inner.parentElement;
     holder.addEventListener("wheel", (e) => {

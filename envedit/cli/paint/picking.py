@@ -39,21 +39,13 @@ class Placed:
 
 
 def lights(placed: PlacedLights, document: Document) -> list[Placed]:
-    """List the lights of a document, in the order of the page (``page/lights.js``).
-
-    That is the map's own by their numbers, then those that were added; where the document has an entry for
-    each of the map's own, the order of the entries.
-    """
-    own = len(placed.lights)
-    known = [entry for entry in document.lights if entry.get("light", 0) <= own]
-    entries = {entry["light"]: entry for entry in known if "light" in entry}
-    if len(entries) < own:
-        first = [entries.get(i + 1, unchanged(i + 1)) for i in range(own)]
-        known = first + [entry for entry in known if "light" not in entry]
-
+    """List the lights of a document: the map's own by their numbers, then added ones (``page/lights.js``)."""
+    entries = {entry["light"]: entry for entry in document.lights if "light" in entry}
+    own = [entries.get(i + 1, unchanged(i + 1)) for i in range(len(placed.lights))]
+    added = [entry for entry in document.lights if "light" not in entry]
     rotation = document.orientation.matrix
     found = []
-    for entry in known:
+    for entry in own + added:
         toward, flux = None, flux_of(entry)
         if "light" in entry:
             toward = placed.lights[entry["light"] - 1].direction

@@ -70,11 +70,10 @@ class Document:
 
     @property
     def placing(self) -> tuple:
-        """What decides what the map is before paint: not the names, roles and order of its lights."""
-        unplaced = "name", "role"
-        lights = [{k: v for k, v in light.items() if k not in unplaced} for light in self.lights]
-        changed = [light for light in lights if light != unchanged(light.get("light"))]
-        placed = sorted(json.dumps(light, sort_keys=True) for light in changed)
+        """What decides what the map is before paint: not the names and roles of its lights."""
+        labels = "name", "role"
+        lights = [{k: v for k, v in light.items() if k not in labels} for light in self.lights]
+        placed = [light for light in lights if light != unchanged(light.get("light"))]
         return placed, self.regions, self.orientation
 
     @property

@@ -1,5 +1,4 @@
-// All lights in a table: name, role, flux in stops, radius in degrees, kelvin; solo, mute, lock, up and down. A click
-// chooses one.
+// All lights in a table: name, role, flux in stops, radius in degrees, kelvin; solo, mute, lock. A click chooses one.
 
 import { degrees, flux, luminance, off, signed, stops } from "./lights.js";
 
@@ -10,7 +9,6 @@ const SWITCHES = [
   ["lock", "L", "The paint leaves this light as it is"],
 ];
 const ROLES = ["", "key", "fill", "rim"]; // as in config/light_schema.py
-const MOVES = [["up", "↑", -1], ["down", "↓", 1]];
 
 export class LightList {
   constructor(holder, lights) {
@@ -46,13 +44,7 @@ export class LightList {
       });
       return made;
     };
-    const chosen = button("choose", i + 1, "Choose its handle on the map; Alt with an arrow key moves it in the list", () => this.lights.choose(i));
-    chosen.addEventListener("keydown", (event) => {
-      const by = event.altKey && { ArrowUp: -1, ArrowDown: 1 }[event.key];
-      if (!by) return;
-      event.preventDefault();
-      this.reorder(i, by, (row) => row.chosen);
-    });
+    const chosen = button("choose", i + 1, "Choose its handle on the map", () => this.lights.choose(i));
     const role = document.createElement("select");
     role.append(...ROLES.map((value) => new Option(value || "–", value)));
     role.dataset.testid = `list-role-${i + 1}`;
@@ -64,17 +56,9 @@ export class LightList {
     const size = input("radius", { type: "number", min: 0.01, max: 90, step: "any" }, (light, value) => ({ size: Math.max(0.01, light.own ? Math.min(20, value / light.own.radius) : Number(value)) }));
     const kelvin = input("kelvin", { type: "number", min: 2000, max: 25000, step: "any" }, (light, value) => this.coloured(light, Number(value)));
     const switches = Object.fromEntries(SWITCHES.map(([key, text, title]) => [key, button(key, text, title, () => this.press(key, i))]));
-    const moves = Object.fromEntries(MOVES.map(([key, text, by]) => [key, button(key, text, `Move ${key} in the list`, () => this.reorder(i, by, (row) => row.moves[key]))]));
     const group = document.createElement("span");
-    group.append(...Object.values(switches), ...Object.values(moves));
-    return { cells: [chosen, name, role, stop, size, kelvin, group], chosen, name, role, stop, size, kelvin, switches, moves };
-  }
-
-  // The focus goes with the light.
-  reorder(i, by, control) {
-    if (!this.lights.reorder(i, by)) return;
-    const row = this.rows[i + by], wanted = control(row);
-    (wanted.disabled ? row.chosen : wanted).focus();
+    group.append(...Object.values(switches));
+    return { cells: [chosen, name, role, stop, size, kelvin, group], chosen, name, role, stop, size, kelvin, switches };
   }
 
   press(key, i) {
@@ -94,8 +78,6 @@ export class LightList {
     write(row.name, light.entry.name ?? "");
     row.name.placeholder = light.own ? `light ${i + 1}` : "added";
     row.role.value = light.entry.role ?? "";
-    row.moves.up.disabled = i === 0;
-    row.moves.down.disabled = i === this.rows.length - 1;
     write(row.stop, Number.isFinite(value) ? signed(value).replace("−", "-").replace("+", "") : "");
     write(row.size, String(+degrees(light).toPrecision(3)));
     write(row.kelvin, kelvin ? String(Math.round(kelvin / 10) * 10) : "");

@@ -28,8 +28,8 @@ export class Lights {
     this.draw();
   }
 
-  // All lights as they are: {entry, own, azimuth, elevation, factor}, the map's own first, by their numbers. Where each
-  // of these has an entry in the document, the order is that of the entries (picking.lights of the server is the same).
+  // All lights as they are: {entry, own, azimuth, elevation}, the map's own first, by their numbers (picking.lights of the
+  // server is the same).
   list(document = this.draft ?? this.on.document()) {
     const own = this.own.map((light) => {
       const entry = document.lights.find((one) => one.light === light.light) ?? { light: light.light, flux: [1, 1, 1], size: 1 };
@@ -37,8 +37,7 @@ export class Lights {
       return { entry, own: light, azimuth, elevation };
     });
     const added = document.lights.filter((one) => !one.light).map((entry) => ({ entry, own: null, azimuth: entry.azimuth, elevation: entry.elevation }));
-    const all = [...own, ...added], at = (light) => document.lights.indexOf(light.entry);
-    return all.every((light) => at(light) >= 0) ? all.sort((a, b) => at(a) - at(b)) : all;
+    return [...own, ...added];
   }
 
   get unit() { return this.own.length ? Math.max(...this.own[0].flux, 1e-6) : 1; }
@@ -51,23 +50,8 @@ export class Lights {
       if (i === index) return change ? [{ ...entry, ...change }] : [];
       return lights.includes(entry) ? [entry] : [];
     });
-    return [...entries, ...this.unlisted()];
-  }
-
-  // Entries of lights that the map does not have.
-  unlisted() {
-    const all = this.list(this.on.document());
-    return this.on.document().lights.filter((one) => !all.some(({ entry }) => entry === one));
-  }
-
-  // Change the place of a light in the list; says whether it has another one now.
-  reorder(index, by) {
-    const entries = this.list().map(({ entry }) => entry), to = index + by;
-    if (!entries[to]) return false;
-    entries.splice(to, 0, ...entries.splice(index, 1));
-    this.chosen = to;
-    this.on.done({ lights: [...entries, ...this.unlisted()] });
-    return true;
+    const unlisted = lights.filter((one) => !all.some(({ entry }) => entry === one)); // of lights that the map does not have
+    return [...entries, ...unlisted];
   }
 
   preview(index, change) {

@@ -5,7 +5,6 @@ What they do is :mod:`envedit.representations.layers.placed_lights`'s.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 from envedit.config.validators import (
@@ -87,15 +86,14 @@ SIZE = 0.5
 """Radius in degrees of an added light where none is given."""
 
 
-@dataclass(frozen=True)
 class LightList(Tables):
     """A list of lights; every entry has all keys that it can have."""
 
     name = "input.lights"
     most = MOST_PLACED
 
-    def _take(self, value: Any) -> tuple[dict[str, Any], ...]:
-        found = super()._take(value)
+    def __call__(self, value: Any) -> tuple[dict[str, Any], ...]:
+        found = super().__call__(value)
         own = [light["light"] for light in found if "light" in light]
         if twice := sorted({n for n in own if own.count(n) > 1}):
             raise ConfigError(
@@ -117,7 +115,7 @@ class LightList(Tables):
                 raise ConfigError(f"{name}.{key}: got none, expected one: a light without `light` is added")
         return {"size": SIZE} | found
 
-    def _schema(self) -> Schema:
+    def schema(self) -> Schema:
         keys = {key: {**(OWN | ADDED)[key].schema(), "description": MEANINGS[key]} for key in MEANINGS}
         both = {"azimuth": ["elevation"], "elevation": ["azimuth"]}
         return self._schema_of({"properties": keys, "dependencies": both})

@@ -34,7 +34,7 @@ class Places(Check):
     least: int
     kind = "list"
 
-    def _take(self, value: Any) -> list[list[float]]:
+    def __call__(self, value: Any) -> list[list[float]]:
         if not isinstance(value, list | tuple) or not self.least <= len(value) <= MOST_POINTS:
             raise WantedError(str(self))
         try:
@@ -44,10 +44,9 @@ class Places(Check):
 
     @property
     def range(self) -> str:
-        """Their form and number."""
         return f"[[azimuth, elevation], ...], {self.least} to {MOST_POINTS}"
 
-    def _schema(self) -> Schema:
+    def schema(self) -> Schema:
         items = _POINT.schema()
         return {"type": "array", "items": items, "minItems": self.least, "maxItems": MOST_POINTS}
 
@@ -74,7 +73,6 @@ MEANINGS = {
 """What each key is, for the reference."""
 
 
-@dataclass(frozen=True)
 class RegionList(Tables):
     """A list of regions."""
 
@@ -92,7 +90,7 @@ class RegionList(Tables):
         _require(name, "factor", found, needed=found["action"] == "scale", where='where action is "scale"')
         return {"softness": 0.0} | found
 
-    def _schema(self) -> Schema:
+    def schema(self) -> Schema:
         keys = {key: {**check.schema(), "description": MEANINGS[key]} for key, check in KEYS.items()}
         shape = [{"required": ["points"]}, {"required": ["polygon"]}]
         brush = {"points": ["radius"], "radius": ["points"]}

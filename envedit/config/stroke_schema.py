@@ -44,7 +44,7 @@ class Color(Check):
     range = '3 numbers, 0 to 1e+06; or "#rrggbb"'
     words = '[r, g, b], or a colour such as "#ffd9a6"'
 
-    def _take(self, value: Any) -> list[float]:
+    def __call__(self, value: Any) -> list[float]:
         if isinstance(value, str):
             if not re.fullmatch("#[0-9a-fA-F]{6}", value):
                 raise WantedError(str(self))
@@ -52,27 +52,25 @@ class Color(Check):
             return [float(round(c, 4)) for c in srgb_to_linear(codes / 255)]
         return _LINEAR(value)
 
-    def _schema(self) -> Schema:
+    def schema(self) -> Schema:
         return {"anyOf": [_LINEAR.schema(), {"type": "string", "pattern": "^#[0-9a-fA-F]{6}$"}]}
 
 
-@dataclass(frozen=True)
 class Ellipse(Check):
     """Centre, radii and, if it is turned, degrees."""
 
     kind = "list"
     range = "[cx, cy, rx, ry] or [cx, cy, rx, ry, degrees]"
 
-    def _take(self, value: Any) -> list[float]:
+    def __call__(self, value: Any) -> list[float]:
         if not isinstance(value, list | tuple) or len(value) not in (4, 5):
             raise WantedError(str(self))
         return Numbers(*_ELLIPSE[: len(value)])(value)
 
-    def _schema(self) -> Schema:
+    def schema(self) -> Schema:
         return Numbers(*_ELLIPSE).schema() | {"minItems": 4}
 
 
-@dataclass(frozen=True)
 class Rectangle(Check):
     """Upper left and lower right corner."""
 
@@ -80,7 +78,7 @@ class Rectangle(Check):
     range = "[x0, y0, x1, y1]"
     words = "[x0, y0, x1, y1] with x1 above x0 and y1 above y0"
 
-    def _take(self, value: Any) -> list[float]:
+    def __call__(self, value: Any) -> list[float]:
         if not isinstance(value, list | tuple) or len(value) != 4:
             raise WantedError(str(self))
         x0, y0, x1, y1 = _CORNERS(value)
@@ -88,7 +86,7 @@ class Rectangle(Check):
             raise WantedError(str(self))
         return [x0, y0, x1, y1]
 
-    def _schema(self) -> Schema:
+    def schema(self) -> Schema:
         return _CORNERS.schema()
 
 
@@ -99,17 +97,16 @@ class Points(Check):
     least: int
     kind = "list"
 
-    def _take(self, value: Any) -> list[list[float]]:
+    def __call__(self, value: Any) -> list[list[float]]:
         if not isinstance(value, list | tuple) or len(value) < self.least:
             raise WantedError(str(self))
         return [_POINT(v) for v in value]
 
     @property
     def range(self) -> str:
-        """Their form and number."""
         return f"[[x, y], ...], at least {self.least}"
 
-    def _schema(self) -> Schema:
+    def schema(self) -> Schema:
         return {"type": "array", "items": _POINT.schema(), "minItems": self.least}
 
 
@@ -161,7 +158,6 @@ MEANINGS = {
 """What each key is, for the reference."""
 
 
-@dataclass(frozen=True)
 class StrokeList(Tables):
     """A list of strokes, each with all of its keys spelled out; see :mod:`envedit.targets.strokes`."""
 
@@ -185,7 +181,7 @@ class StrokeList(Tables):
             found[key] = named(f"{name}.{key}", check, stroke.get(key, default))
         return found
 
-    def _schema(self) -> Schema:
+    def schema(self) -> Schema:
         properties: Schema = {}
         for key, checks in stroke_keys().items():
             each = [check.schema() for check in dict.fromkeys(checks)]

@@ -15,7 +15,7 @@ import contextlib
 import difflib
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from numbers import Integral, Real
 from os import PathLike, fspath
@@ -52,23 +52,17 @@ class Check(ABC):
         """Which values of that type; "" for all."""
         return ""
 
+    @abstractmethod
     def __call__(self, value: Any) -> Any:
         """Return a value normalised; WantedError if it is refused."""
-        return self._take(value)
 
+    @abstractmethod
     def schema(self) -> Schema:
         """Return what is accepted as JSON Schema; where that cannot say all, it accepts more."""
-        return self._schema()
 
     def __str__(self) -> str:
         """Say what is accepted, as the end of a sentence."""
         return self.words or self.range
-
-    @abstractmethod
-    def _take(self, value: Any) -> Any: ...
-
-    @abstractmethod
-    def _schema(self) -> Schema: ...
 
 
 class Tables(Check):
@@ -83,7 +77,7 @@ class Tables(Check):
     name: str  # of the key, "input.lights"
     most: int | None = None  # entries; None: any number
 
-    def _take(self, value: Any) -> tuple[dict[str, Any], ...]:
+    def __call__(self, value: Any) -> tuple[dict[str, Any], ...]:
         if not isinstance(value, list | tuple) or not all(isinstance(v, dict) for v in value):
             raise WantedError(str(self))
         if self.most is not None and len(value) > self.most:
@@ -101,7 +95,6 @@ class Tables(Check):
 
     @property
     def range(self) -> str:
-        """How many."""
         return "" if self.most is None else f"at most {self.most}"
 
     def _schema_of(self, table: Schema) -> Schema:
@@ -121,7 +114,7 @@ class String(Check):
     kind = "string"
     words = "a string"
 
-    def _take(self, value: Any) -> str:
+    def __call__(self, value: Any) -> str:
         if isinstance(value, PathLike):
             value = fspath(value)
         if not isinstance(value, str) or len(value) < self.least:
@@ -131,43 +124,39 @@ class String(Check):
             raise WantedError("a string of valid characters, without NUL")
         return str(value)
 
-    def _schema(self) -> Schema:
+    def schema(self) -> Schema:
         return {"type": "string"} | ({"minLength": self.least} if self.least else {})
 
 
-@dataclass(frozen=True)
 class Boolean(Check):
     """True or false."""
 
     kind = "boolean"
     words = "true or false"
 
-    def _take(self, value: Any) -> bool:
+    def __call__(self, value: Any) -> bool:
         if not isinstance(value, bool):
             raise WantedError(str(self))
         return value
 
-    def _schema(self) -> Schema:
+    def schema(self) -> Schema:
         return {"type": "boolean"}
 
 
-@dataclass(frozen=True, init=False)
 class Choice(Check):
     """One of some names, or of those that installed packages add to a group of entry points."""
 
-    names: tuple[str, ...]
-    group: str
     kind = "string"
 
     def __init__(self, *names: str, group: str = "") -> None:
-        object.__setattr__(self, "names", names)
-        object.__setattr__(self, "group", group)
+        self.names = names
+        self.group = group
 
     @property
     def _added(self) -> tuple[str, ...]:
         return extensions.names(self.group) if self.group else ()
 
-    def _take(self, value: Any) -> str:
+    def __call__(self, value: Any) -> str:
         if isinstance(value, str) and (value in self.names or value in self._added):
             return value
         hint = meant(value, self.names, "")
@@ -178,10 +167,9 @@ class Choice(Check):
 
     @property
     def range(self) -> str:
-        """The names."""
         return ", ".join(f'"{name}"' for name in self.names)
 
-    def _schema(self) -> Schema:
+    def schema(self) -> Schema:
         return {"enum": [*self.names, *self._added]}
 
 
@@ -197,7 +185,7 @@ class Integer(Check):
     even: bool = False
     kind = "integer"
 
-    def _take(self, value: Any) -> int:
+    def __call__(self, value: Any) -> int:
         whole = isinstance(value, Integral) and not isinstance(value, bool)
         if not whole or not self.low <= value <= self.high or (self.even and value % 2):
             raise WantedError(str(self))
@@ -208,10 +196,9 @@ class Integer(Check):
 
     @property
     def range(self) -> str:
-        """First and last."""
         return f"{'even, ' if self.even else ''}{self.low} to {self.high}"
 
-    def _schema(self) -> Schema:
+    def schema(self) -> Schema:
         limits: Schema = {"type": "integer", "minimum": self.low, "maximum": self.high}
         return limits | ({"multipleOf": 2} if self.even else {})
 
@@ -225,7 +212,7 @@ class Number(Check):
     positive: bool = False
     kind = "number"
 
-    def _take(self, value: Any) -> float:
+    def __call__(self, value: Any) -> float:
         if not isinstance(value, Real) or isinstance(value, bool):
             raise WantedError(str(self))
         try:
@@ -246,29 +233,26 @@ class Number(Check):
 
     @property
     def range(self) -> str:
-        """Least and most."""
         if math.isinf(self.high):
             return "" if math.isinf(self.low) else f"{'above' if self.positive else 'at least'} {self.low:g}"
         return f"{'above ' if self.positive else ''}{self.low:g} to {self.high:g}"
 
-    def _schema(self) -> Schema:
+    def schema(self) -> Schema:
         limits: Schema = {"type": "number"}
         if not math.isinf(self.low):
             limits["exclusiveMinimum" if self.positive else "minimum"] = self.low
         return limits | ({} if math.isinf(self.high) else {"maximum": self.high})
 
 
-@dataclass(frozen=True, init=False)
 class Numbers(Check):
     """A list with one value for each of some checks."""
 
-    checks: tuple[Check, ...]
     kind = "list"
 
     def __init__(self, *checks: Check) -> None:
-        object.__setattr__(self, "checks", checks)
+        self.checks = checks
 
-    def _take(self, value: Any) -> Sequence[float]:
+    def __call__(self, value: Any) -> Any:
         if not isinstance(value, list | tuple) or len(value) != len(self.checks):
             raise WantedError(str(self))
         return [check(v) for check, v in zip(self.checks, value, strict=True)]
@@ -278,11 +262,10 @@ class Numbers(Check):
 
     @property
     def range(self) -> str:
-        """How many, and each one's range where all have the same."""
         same = len({check.range for check in self.checks}) == 1 and self.checks[0].range
         return f"{len(self.checks)} numbers{f', each {same}' if same else ''}"
 
-    def _schema(self) -> Schema:
+    def schema(self) -> Schema:
         items = [check.schema() for check in self.checks]
         return {"type": "array", "items": items, "minItems": len(items), "maxItems": len(items)}
 
@@ -293,8 +276,8 @@ class Pair(Numbers):
     def __init__(self, check: Check) -> None:
         super().__init__(check, check)
 
-    def _take(self, value: Any) -> tuple[float, ...]:
-        return tuple(super()._take(value))
+    def __call__(self, value: Any) -> tuple[float, ...]:
+        return tuple(super().__call__(value))
 
 
 # ---- what other checks accept ------------------------------------------------------------------------------
@@ -305,13 +288,13 @@ class Either(Check):
 
     checks: tuple[Check, ...]
 
-    def _take(self, value: Any) -> Any:
+    def __call__(self, value: Any) -> Any:
         for check in self.checks:
             with contextlib.suppress(WantedError):
                 return check(value)
         raise WantedError(self.words)
 
-    def _schema(self) -> Schema:
+    def schema(self) -> Schema:
         return {"anyOf": [check.schema() for check in self.checks]}
 
 
@@ -321,7 +304,7 @@ class OrAuto(Check):
 
     check: Check
 
-    def _take(self, value: Any) -> Any:
+    def __call__(self, value: Any) -> Any:
         try:
             return value if isinstance(value, str) and value == "auto" else self.check(value)
         except WantedError as error:
@@ -332,15 +315,13 @@ class OrAuto(Check):
 
     @property
     def kind(self) -> str:
-        """Of the other check."""
         return self.check.kind
 
     @property
     def range(self) -> str:
-        """Of the other check, and "auto"."""
         return f'{self.check.range or self.check}; or "auto"'
 
-    def _schema(self) -> Schema:
+    def schema(self) -> Schema:
         return {"anyOf": [{"const": "auto"}, self.check.schema()]}
 
 
@@ -350,7 +331,7 @@ class OneOrMore(Check):
 
     check: Check
 
-    def _take(self, value: Any) -> Any:
+    def __call__(self, value: Any) -> Any:
         try:
             if isinstance(value, list | tuple):
                 return tuple(self.check(v) for v in value)
@@ -363,17 +344,15 @@ class OneOrMore(Check):
 
     @property
     def kind(self) -> str:
-        """Of one, or a list."""
         return f"{self.check.kind} or list"
 
-    def _schema(self) -> Schema:
+    def schema(self) -> Schema:
         return {"anyOf": [self.check.schema(), {"type": "array", "items": self.check.schema()}]}
 
 
 # ---- single keys -------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
 class Kelvin(Either):
     """A colour temperature for which there are chromaticities, or 0."""
 
@@ -383,7 +362,6 @@ class Kelvin(Either):
     checks = Number(0, 0), Number(2000, 25000)
 
 
-@dataclass(frozen=True)
 class Weight(Either):
     """A constant weight, or the two ends of a geometric ramp."""
 
@@ -393,7 +371,6 @@ class Weight(Either):
     checks = Number(0), Pair(Number(0, positive=True))
 
 
-@dataclass(frozen=True)
 class RowRange(Either):
     """The rows that an edit may change: a name, or the first and last of them."""
 
@@ -402,14 +379,13 @@ class RowRange(Either):
     words = '"upper", "all" or [first, last], rows from 0 at the zenith, last included'
     checks = Choice("upper", "all"), Pair(Integer(0, MOST_DIM))
 
-    def _take(self, value: Any) -> str | tuple[int, int]:
-        rows = super()._take(value)
+    def __call__(self, value: Any) -> str | tuple[int, int]:
+        rows = super().__call__(value)
         if isinstance(rows, tuple) and rows[0] > rows[1]:
             raise WantedError(self.words)
         return rows
 
 
-@dataclass(frozen=True)
 class View(Either):
     """A view: the id of its sensor, or its index."""
 
@@ -418,7 +394,6 @@ class View(Either):
     checks = String(least=1), Integer(0, MOST_DIM)
 
 
-@dataclass(frozen=True)
 class ViewList(Check):
     """Sensors of a scene: "all", or a list of ids and of indices from 0, none of them twice."""
 
@@ -426,7 +401,7 @@ class ViewList(Check):
     range = '"all", or ids and indices from 0'
     words = '"all", or a list of ids of sensors or of indices from 0, each once'
 
-    def _take(self, value: Any) -> str | tuple[int | str, ...]:
+    def __call__(self, value: Any) -> str | tuple[int | str, ...]:
         if isinstance(value, str) and value == "all":
             return value
         try:
@@ -436,12 +411,11 @@ class ViewList(Check):
             pass
         raise WantedError(str(self))
 
-    def _schema(self) -> Schema:
+    def schema(self) -> Schema:
         views: Schema = {"type": "array", "items": View().schema(), "minItems": 1, "uniqueItems": True}
         return {"anyOf": [{"const": "all"}, views]}
 
 
-@dataclass(frozen=True)
 class Parameters(Check):
     """A flat table of strings, numbers and booleans."""
 
@@ -449,7 +423,7 @@ class Parameters(Check):
     range = "of strings, numbers and booleans"
     words = f"a table {range}"
 
-    def _take(self, value: Any) -> dict[str, str | float | bool]:
+    def __call__(self, value: Any) -> dict[str, str | float | bool]:
         if not isinstance(value, dict):
             raise WantedError(str(self))
         return {String()(name): self._scalar(scalar) for name, scalar in value.items()}
@@ -465,7 +439,7 @@ class Parameters(Check):
             return Number(-math.inf)(value)
         raise WantedError(str(self))
 
-    def _schema(self) -> Schema:
+    def schema(self) -> Schema:
         return {"type": "object", "additionalProperties": {"type": ["string", "number", "boolean"]}}
 
 

@@ -31,7 +31,7 @@ from envedit.representations.layers.layers import Layers
 from envedit.results import Result
 from envedit.scene.renderings import rendered
 from envedit.solve import adam_loop, adam_solver, feasibility
-from envedit.solve.edit_state import Interrupted, Stopped, Watch, keeping
+from envedit.solve.edit_state import Interrupted, Stopped, Watch
 from envedit.solve.likelihood import SIGMA, Likelihood, sizes
 from envedit.targets import working_size
 from envedit.targets.target import Target
@@ -75,23 +75,33 @@ def run(
     on.
     """
     edit = _Edit(settings, folder, base, watch or Watch(), memory or inputs.Given())
-    edit.load()
-    if edit.to_solve:
-        edit.prepare()
-        edit.solve(resume)
-    else:
-        edit.leave()
-    edit.adjust()
-    if edit.transport and edit.target.coverage is not None:
-        edit.check_feasibility()
-    edit.render()
-    edit.render_variants()
-    edit.measure()
-    if edit.target.photo:
-        edit.compare_photograph()
-    if edit.job:
-        edit.warn_of_quality()
-    return edit.result()
+    try:
+        edit.load()
+        if edit.to_solve:
+            edit.prepare()
+            edit.solve(resume)
+        else:
+            edit.leave()
+        edit.adjust()
+        if edit.transport and edit.target.coverage is not None:
+            edit.check_feasibility()
+        edit.render()
+        edit.render_variants()
+        edit.measure()
+        if edit.target.photo:
+            edit.compare_photograph()
+        if edit.job:
+            edit.warn_of_quality()
+        return edit.result()
+    except (Interrupted, Stopped) as stop:
+        edit.hand_over(stop)
+        raise
+    except NumericalError as error:
+        if edit.edited is None:
+            raise
+        stopped = Stopped(str(error), edit.edited)
+        edit.hand_over(stopped)
+        raise stopped from error
 
 
 @dataclass
@@ -125,12 +135,13 @@ class _Clock:
 class _Edit:
     """A run: its stages are methods, which are called in the order in which they stand.
 
-    ``transport`` and ``job`` are None where the map is left as it is; ``notes`` and ``warnings`` grow from
-    stage to stage.
+    ``transport`` and ``job`` are None where the map is left as it is; ``edited`` is None until it is solved
+    for; ``notes`` and ``warnings`` grow from stage to stage.
     """
 
     transport = None
     job = None
+    edited = None
     feasible = None
     outliers = None
     frozen = None
@@ -201,7 +212,7 @@ class _Edit:
         """Leave the map as it is: without a target it is compared with the initial rendering."""
         self.warnings += config.unused(self.settings)
         self.rows = Rows.of(len(self.original))
-        self.solved_map = self.original
+        self.edited = self.solved_map = self.original
         self.watch.stage("adjusting the map")
         if self.target is None:
             with self.clock("judge_s"):
@@ -259,10 +270,10 @@ class _Edit:
         solver = "gauss-newton" if self.job.newton else "adam"
         no_step = self.job.settings is not self.settings
         self.warnings += config.unused(self.settings, None if no_step else solver)
-        with self.clock("edit_s"), self._carrying():
+        with self.clock("edit_s"):
             self.watch.stage("editing")
             self.params, self.state = self.start.optimise(resume)
-            self.solved_map = self.job.decode(self.params)
+            self.edited = self.solved_map = self.job.decode(self.params)
         photo = self.target.photo
         if self.small is self.scene:
             self.target = self.job.target  # a resumed run has the picture that it began with
@@ -290,33 +301,25 @@ class _Edit:
             self.level = float(np.exp(np.log(before / after).mean()))
             self.target = self.target.developed(self.target.photo.exposed_by(-np.log(np.full(3, self.level))))
 
-    @contextlib.contextmanager
-    def _carrying(self, envmap=None):
-        """Let an edit that is cut short carry its map in the units of the file, and whose units these are.
+    def hand_over(self, stop):
+        """Bring the map of an edit that is cut short to the units of the file; say whose units these are.
 
-        It is ``envmap`` where numbers fail after the loop. Where its units leave float32, it is cut at what
-        the file could have been read with.
+        Where these leave float32, it is cut at what the file could have been read with.
         """
+        stop.given = self.map
         try:
-            with contextlib.nullcontext() if envmap is None else keeping(envmap):
-                yield
-        except (Interrupted, Stopped) as stop:
-            stop.given = self.map
-            try:
-                stop.envmap = self.map.as_stored(stop.envmap, self.degrees)
-            except NumericalError:
-                most = np.float32(BRIGHTEST * min(self.map.scale, 1.0))
-                stop.envmap = self.map.as_stored(np.minimum(stop.envmap, most), self.degrees)
-            raise
+            stop.envmap = self.map.as_stored(stop.envmap, self.degrees)
+        except NumericalError:
+            most = np.float32(BRIGHTEST * min(self.map.scale, 1.0))
+            stop.envmap = self.map.as_stored(np.minimum(stop.envmap, most), self.degrees)
 
     def adjust(self):
         """Adjust lights, exposure and colours as the configuration asks; predict the transport's error."""
-        with self.clock("edit_s"), self._carrying(self.solved_map):
+        with self.clock("edit_s"):
             self.edited, self.adjustments = self._adjusted(self.solved_map)
         if self.transport:
             self.warnings += self.transport.warnings
-            with self._carrying(self.edited):
-                self.predicted_error = self.transport.coarse_error(self.edited)
+            self.predicted_error = self.transport.coarse_error(self.edited)
 
     def _adjusted(self, envmap):
         if self.level != 1:
@@ -348,7 +351,7 @@ class _Edit:
     def render(self):
         """Render the result with fresh samples, and what it is compared with."""
         target = self.target
-        with self.clock("judge_s"), self._carrying(self.edited):
+        with self.clock("judge_s"):
             self.watch.stage("rendering the result")
             spp = self.settings.output.spp
             edited, samples, noise = self.scene.sampled(self.edited, spp, self.seeds.judged)
@@ -379,7 +382,7 @@ class _Edit:
     def render_variants(self):
         """Render the other explanations of paint."""
         for explanation in self.start.layers.others if self.job else ():
-            with self.clock("judge_s"), self._carrying(self.edited):
+            with self.clock("judge_s"):
                 self.watch.stage("rendering other explanations")
                 changed, _ = self._adjusted(self.start.layers.map_of(explanation))
                 stored = self.map.as_stored(changed, self.degrees)
@@ -394,27 +397,26 @@ class _Edit:
         """Set the metrics: how good renderings and map are, and what the solver did."""
         # ---- Renderings and maps
         tonemap = self.settings.output.tonemap
-        with self._carrying(self.edited):
-            self.stored = self.map.as_stored(self.edited, self.degrees)
-            self.metrics = self._compared(slice(None), self.scene.rows)
-            self.metrics |= {
-                "envmap": None,
-                "tonemap": TONEMAP_TEXT.get(tonemap, tonemap),
-                "active_rows": [self.rows.first, self.rows.last],
-                "natural": naturalness.natural(self.edited, self.original, self.target.envmap),
-            }
-            if len(self.scene.views) > 1:
-                views = [{"name": view.name, **self._compared(view.rows)} for view in self.scene.views]
-                self.metrics["views"] = views
-            if self.metrics["painted"]:
-                self.metrics["painted"]["reachable"] = self.feasible.share if self.feasible else None
-            if self.target.envmap is not None:
-                initial, target, edited = (
-                    self.maps[name][self.rows.slice] for name in ("initial", "target", "edited")
-                )
-                self.metrics["envmap"] = metrics.compare(edited, target, tonemap, self.lpips)
-                self.metrics["sun_offset_texels"] = metrics.sun_offset(edited, target)
-                self.metrics["initial_envmap"] = metrics.compare(initial, target, tonemap, self.lpips)
+        self.stored = self.map.as_stored(self.edited, self.degrees)
+        self.metrics = self._compared(slice(None), self.scene.rows)
+        self.metrics |= {
+            "envmap": None,
+            "tonemap": TONEMAP_TEXT.get(tonemap, tonemap),
+            "active_rows": [self.rows.first, self.rows.last],
+            "natural": naturalness.natural(self.edited, self.original, self.target.envmap),
+        }
+        if len(self.scene.views) > 1:
+            views = [{"name": view.name, **self._compared(view.rows)} for view in self.scene.views]
+            self.metrics["views"] = views
+        if self.metrics["painted"]:
+            self.metrics["painted"]["reachable"] = self.feasible.share if self.feasible else None
+        if self.target.envmap is not None:
+            initial, target, edited = (
+                self.maps[name][self.rows.slice] for name in ("initial", "target", "edited")
+            )
+            self.metrics["envmap"] = metrics.compare(edited, target, tonemap, self.lpips)
+            self.metrics["sun_offset_texels"] = metrics.sun_offset(edited, target)
+            self.metrics["initial_envmap"] = metrics.compare(initial, target, tonemap, self.lpips)
 
         # ---- The solver
         fitted = self.job.representation.fitted if self.job else None

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -131,12 +130,3 @@ class EditState:
             photo=None if target.photo is None else Photographed.of(target.photo),
             clipped=target.clipped,
         )
-
-
-@contextlib.contextmanager
-def keeping(envmap: np.ndarray) -> Iterator[None]:
-    """Let numbers that fail after the loop carry the map that it found: Stopped for NumericalError."""
-    try:
-        yield
-    except NumericalError as error:
-        raise Stopped(str(error), envmap) from error

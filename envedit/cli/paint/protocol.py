@@ -19,7 +19,16 @@ from envedit.config.method_schema import Solve
 from envedit.config.region_schema import RegionList
 from envedit.config.schema import FIELDS
 from envedit.config.stroke_schema import StrokeList
-from envedit.config.validators import Choice, Kelvin, Number, String, WantedError, show
+from envedit.config.validators import (
+    Choice,
+    Integer,
+    Kelvin,
+    Number,
+    Numbers,
+    String,
+    WantedError,
+    show,
+)
 from envedit.core.errors import ConfigError
 from envedit.core.rotations import Orientation
 
@@ -36,7 +45,8 @@ SOURCES = ("transport", "mitsuba", "saved")
 PHASES = ("drawing", "dragging", "done")
 """A stroke is being drawn, a light is being dragged, or neither."""
 _LARGEST = 65504.0
-_FAR = 1e30
+_COUNT = Integer(0, 2**53)
+_POINT = Numbers(*3 * [Number(-1e30, 1e30)])
 
 
 def unchanged(number: int | None) -> dict[str, Any]:
@@ -212,25 +222,22 @@ def read(text: str | bytes, client: str = "") -> Edit | Pick | Choose | Open | A
     kind = found.get("type") if isinstance(found, dict) else None
     try:
         if kind == "document":
-            phase = found.get("phase", "done")
-            if phase not in PHASES:
-                raise BadMessageError(f"phase: got {show(phase)[:80]}, expected one of {', '.join(PHASES)}")
-            number, painting = _count(found.get("number", 0)), _count(found.get("painting", 0))
+            phase = Choice(*PHASES)(found.get("phase", "done"))
+            number = _COUNT(found.get("number", 0))
+            painting = _COUNT(found.get("painting", 0))
             return Edit(document(found.get("document")), phase, client, number, painting)
         if kind == "pick":
             x, y = (Number(0, 1)(found.get(name)) for name in "xy")
-            light = int(Number(-1, 100)(found.get("light", -1)))
-            view = _count(found.get("view", 0))
+            light = Integer(-1, 100)(found.get("light", -1))
+            view = _COUNT(found.get("view", 0))
             of = Choice(*PICKED)(found.get("of", "highlight"))
-            number = _count(found.get("number", 0))
-            return Pick(x, y, light, number, client, view, of, _point(found.get("point", [])))
+            number = _COUNT(found.get("number", 0))
+            point = tuple(_POINT(found["point"])) if found.get("point") else ()
+            return Pick(x, y, light, number, client, view, of, point)
         if kind == "open":
-            name, envmap = String()(found.get("name")), String()(found.get("envmap", ""))
-            if not name:
-                raise BadMessageError("open: got no name, expected a scene or a configuration")
-            return Open(name, envmap)
+            return Open(String(least=1)(found.get("name")), String()(found.get("envmap", "")))
         if kind == "choose":
-            return Choose(_count(found.get("explanation")))
+            return Choose(_COUNT(found.get("explanation")))
         if kind == "look":
             return ApplyLook(String()(found.get("name")), String()(found.get("text")))
     except WantedError as error:
@@ -243,19 +250,6 @@ def read(text: str | bytes, client: str = "") -> Edit | Pick | Choose | Open | A
 
 def _refused(name):
     raise ValueError(name)
-
-
-def _point(value):
-    """Read a point of the scene; () for none."""
-    if not isinstance(value, list) or len(value) not in (0, 3):
-        raise BadMessageError(f"point: got {show(value)[:80]}, expected three numbers")
-    return tuple(Number(-_FAR, _FAR)(one) for one in value)
-
-
-def _count(value):
-    if not isinstance(value, int) or not 0 <= value < 2**53:
-        raise BadMessageError(f"number: got {show(value)[:80]}, expected a count")
-    return value
 
 
 def frame(kind: str, source: str, count: int, image: np.ndarray, view: int = 0) -> bytes:

@@ -333,11 +333,8 @@ class Session:
     def _step(self):
         began = time.perf_counter()
         self.solution.step()
-        history = self.solution.run.history
-        self.status["iterations"] = len(history)
+        self.status["iterations"] = len(self.solution.run.history)
         self.status["steps"] += 1
-        if history:
-            self.status["residual"] = history[-1]["residual"]
         self.status["ms"] = round(1000 * (time.perf_counter() - began), 1)
         self._show()
         self.tell_state()

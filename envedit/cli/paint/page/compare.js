@@ -10,7 +10,7 @@ const NAMES = { strokes: "strokes", lights: "lights", regions: "regions of the m
 
 export class Compare {
   constructor(frames, displays, history, on) {
-    Object.assign(this, { frames, displays, history, on, kept: null, thumbs: new WeakMap(), drawn: [], asked: false }); // on: view(), send(message)
+    Object.assign(this, { frames, displays, history, on, kept: null, thumbs: new WeakMap(), drawn: [] }); // on: view(), send(message)
     displays.sky = new Display($("sky"), "radiance");
     this.zoom = new Zoom($("sky").parentElement);
     $("keep-a").addEventListener("click", () => this.keep());
@@ -58,7 +58,6 @@ export class Compare {
   // ---- the map, large
 
   large() {
-    this.asked = true;
     $("sky-size").textContent = "";
     this.displays.sky.show(this.frames.map[0]);
     $("sky-dialog").showModal();

@@ -208,7 +208,7 @@ const RECEIVED = {
       displays.render.draw();
     }
     if (message.state === "done") compare.again();
-    if (message.client === client && message.number) note({ status: message.number, of: message.frame, state: message.state, iterations: message.iterations, steps: message.steps, residual: message.residual });
+    if (message.client === client && message.number) note({ status: message.number, of: message.frame, state: message.state, iterations: message.iterations, steps: message.steps });
     state(message.state, message.text ?? told(message));
   },
   doing(message) { $("status").textContent = `${told(last)} · ${message.text}`; },

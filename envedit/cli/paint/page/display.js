@@ -5,7 +5,7 @@ const INSET = [[0.8424791, 0.0784336, 0.0792237], [0.0423282, 0.8784686, 0.07916
 const OUTSET = [[1.196879, -0.0980209, -0.0990297], [-0.0528969, 1.1519031, -0.0989612], [-0.0529716, -0.0980435, 1.1510737]];
 const CONTRAST = [15.5, -40.14, 31.96, -6.868, 0.4298, 0.1191, -0.00232], DARKEST = -12.47393, STOPS = 16.500003;
 const BANDS = ["000000", "2b0a52", "1d2a8f", "1560bd", "1596c9", "17b3a0", "808080", "6cbf3b", "c9d62b", "f5c518", "f28a1c", "e23b2e", "ffffff"]
-  .map((hex) => [0, 2, 4].map((i) => parseInt(hex.slice(i, i + 2), 16) / 255));
+  .map((hex) => [0, 2, 4].map((i) => parseInt(hex.slice(i, i + 2), 16)));
 const GREY = 0.18, LUMINANCE = [0.2126, 0.7152, 0.0722];
 
 export class Display {
@@ -62,11 +62,8 @@ export class Display {
       const bytes = this.bytes();
       return (data, to, pixels, of) => { for (let c = 0; c < 3; c++) data[to + c] = bytes[pixels[of + c]]; };
     }
-    const scale = 2 ** stops;
-    return (data, to, pixels, of) => {
-      const shown = show([0, 1, 2].map((c) => Math.max(HALF[pixels[of + c]] * scale, 0)));
-      for (let c = 0; c < 3; c++) data[to + c] = 255 * shown[c];
-    };
+    const linear = HALF.map((e) => Math.max(e * 2 ** stops, 0));
+    return (data, to, pixels, of) => show(linear[pixels[of]], linear[pixels[of + 1]], linear[pixels[of + 2]], data, to);
   }
 
   // The left part as it was before, whose frame may have another size.
@@ -101,16 +98,22 @@ export class Display {
   }
 }
 
-const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
-function agx(e) {
-  const curve = (v) => {
-    const t = Math.min(1, Math.max(0, (Math.log2(Math.max(v, 1e-9)) - DARKEST) / STOPS));
-    return CONTRAST.reduce((sum, factor) => sum * t + factor, 0);
-  };
-  const display = INSET.map((row) => curve(dot(row, e)));
-  return OUTSET.map((row) => Math.min(1, Math.max(0, dot(row, display))));
+// Radiance r, g, b as bytes of an image from an index on; a large map has millions: no arrays are made.
+const dot = (row, r, g, b) => row[0] * r + row[1] * g + row[2] * b;
+const contrast = (v) => {
+  const t = Math.min(1, Math.max(0, (Math.log2(Math.max(v, 1e-9)) - DARKEST) / STOPS));
+  let sum = 0;
+  for (const factor of CONTRAST) sum = sum * t + factor;
+  return sum;
+};
+function agx(r, g, b, data, to) {
+  const x = contrast(dot(INSET[0], r, g, b)), y = contrast(dot(INSET[1], r, g, b)), z = contrast(dot(INSET[2], r, g, b));
+  for (let c = 0; c < 3; c++) data[to + c] = 255 * dot(OUTSET[c], x, y, z);
 }
-const band = (e) => BANDS[Math.min(12, Math.max(0, Math.round(Math.log2(Math.max(dot(LUMINANCE, e), 1e-9) / GREY) + 6)))];
+function band(r, g, b, data, to) {
+  const stops = Math.log2(Math.max(dot(LUMINANCE, r, g, b), 1e-9) / GREY), color = BANDS[Math.min(12, Math.max(0, Math.round(stops) + 6))];
+  for (let c = 0; c < 3; c++) data[to + c] = color[c];
+}
 
 const HALF = Float32Array.from({ length: 65536 }, (_, bits) => {
   const sign = bits & 0x8000 ? -1 : 1, exponent = (bits >> 10) & 31, fraction = bits & 1023;

@@ -5,11 +5,6 @@ Some LLVM releases load and compile small kernels, then abort the whole process 
 child process is the one to try: it selects the variant, traces a white environment over a grey plane, whose
 radiance is the plane's albedo, and reports step by step on its standard output. What it managed to say before
 it died, and its last words, are the diagnosis.
-
-    envedit doctor [--variant llvm_ad_rgb]        # exit code 0, or 4 with the remedy
-
-:func:`ensure` is for programs: it remembers a success in the user's cache folder until mitsuba, drjit or the
-LLVM library changes, so that later runs pay a millisecond.
 """
 
 from __future__ import annotations

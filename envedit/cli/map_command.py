@@ -1,14 +1,4 @@
-"""What the commands on a map alone share: options, the object of ``--json``, exit codes.
-
-.. code-block:: python
-
-   def main(argv: list[str] | None = None) -> int:
-       parser = map_command.make_parser("adjust", "Adjust a map.", ["envedit adjust sky.hdr --exposure 1"])
-       parser.add_argument("map", ...)
-       return map_command.run(parser, argv, _adjust)
-
-The action says what it does by ``console.say`` and puts what programs read into ``console.facts``.
-"""
+"""What the commands on a map alone share: options, the object of ``--json``, exit codes."""
 
 from __future__ import annotations
 
@@ -78,7 +68,10 @@ def run(
     argv: list[str] | None,
     action: Callable[[argparse.Namespace, Console], None],
 ) -> int:
-    """Carry out a command, report its errors, with ``--json`` in the object too, and return its exit code."""
+    """Carry out a command, report its errors, with ``--json`` in the object too, and return its exit code.
+
+    The action says what it does by ``console.say`` and puts what programs read into ``console.facts``.
+    """
     arguments = parser.parse_args(argv)
     terminal = Console(one_object=arguments.json)
 

@@ -41,15 +41,6 @@ def sweep(
 ) -> list[Outcome]:
     """Carry out all jobs that are not done, and report the progress.
 
-    .. code-block:: python
-
-       jobs = [
-           job(f"{name}-{angle}", {"input": {"envmap": file}, "target": {"rotate_degrees": angle}})
-           for name, file in maps.items() for angle in (60, 140)
-       ]
-       outcomes = sweep(jobs, "runs/angles")
-       measured = [json.loads((job.folder("runs/angles") / "metrics.json").read_text()) for job in jobs]
-
     Jobs of the same content are run once. ``out`` is the folder of the jobs' folders; ``sweep.tsv`` in it
     lists names, states, seconds, folders and errors. There are ``workers`` jobs at a time on this machine, by
     default one for every four cores; with a ``scheduler``, the address of Dask's, that does not count. A job

@@ -591,18 +591,18 @@ class Session:
 
     # ---- results -------------------------------------------------------------------------------------------
 
-    def save(self, import_s: float = 0.0) -> list[str]:
+    def save(self) -> list[str]:
         """Write ``painted.toml`` and the folder of an ``envedit run`` of it; returns its warnings.
 
         The run goes on from the solution that is shown, which is solved to its end first.
         """
         self._saving = True
         try:
-            return self._save(import_s)
+            return self._save()
         finally:
             self._saving = False
 
-    def _save(self, import_s):
+    def _save(self):
         project, folder = self.project, self.project.folder
 
         # ---- The solution that is shown, to its end
@@ -625,7 +625,7 @@ class Session:
         def stage(text):
             self.tell.say({"type": "saving", "text": text})
 
-        result, warnings = self._carried_out(settings, folder, stage, import_s)
+        result, warnings = self._carried_out(settings, folder, stage)
 
         # ---- What was saved, no less sharp than what is shown, and how it differs
         saved, rows = result.maps["edited"], tuple(view.rows for view in result.views)
@@ -644,7 +644,7 @@ class Session:
         self.tell.say({"type": "saved", **told})
         return warnings
 
-    def _carried_out(self, settings, folder, stage, import_s=0.0):
+    def _carried_out(self, settings, folder, stage):
         """Carry a configuration out as `envedit run` does; returns the result, and warnings of its files."""
         base = self.project.base
         with output_folder.alone(folder):
@@ -653,7 +653,7 @@ class Session:
             watch = pipeline.Watch(stage, self._progress)
             result = pipeline.run(settings, folder=folder, base=base, watch=watch)
             stage("writing")
-            return result, run_folder.write(folder, result, import_s)
+            return result, run_folder.write(folder, result, import_s=0.0)
 
     def _match(self, settings):
         """Find the light of a photograph; its map is painted on, at the resolution of the input's file."""

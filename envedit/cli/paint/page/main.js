@@ -371,37 +371,38 @@ function madeBy(shares) {
   return `Light of this place: ${[...parts.map(([i, share]) => `${percent(share)} by ${named(i)}`), `${percent(Math.max(0, rest))} by the rest of the map`].join(", ")}`;
 }
 
+// What changes the map by a pointer: shown while it is down, and a step of the history afterwards.
+const edits = {
+  document: () => history.document,
+  preview: (change) => history.preview(change, "dragging"),
+  done: (change) => history.push(change),
+};
 const lights = new Lights($("map-stack"), $("handles"), {
   set: $("light"), name: $("light-name"), flux: $("light-flux"), color: $("light-color"), size: $("light-size"),
   shaped: $("light-shaped"), shape: $("light-shape"), aspect: $("light-aspect"), rotation: $("light-rotation"), softness: $("light-softness"),
   mute: $("light-mute"), remove: $("light-delete"), hint: $("ring-hint"), fluxValue: $("light-flux-value"), sizeValue: $("light-size-value"),
 }, {
-  document: () => history.document,
-  preview: (change) => history.preview(change, "dragging"),
-  done: (change) => history.push(change),
+  ...edits,
   back: () => send(history.document, "done"),
   drawn: (all) => listed.draw(all),
 });
 const listed = new LightList($("light-list"), lights);
 const level = new Level($("map-stack"), $("level-line"), $("level"), {
-  document: () => history.document,
+  ...edits,
   preview(change) {
     lights.draft = { ...history.document, ...change };
-    history.preview(change, "dragging");
+    edits.preview(change);
     lights.draw();
     level.draw(lights.draft);
     orient(lights.draft);
   },
-  done: (change) => history.push(change),
 });
 const regions = new Regions($("map-stack"), $("handles"), $("regions"), {
   button: $("region"), set: $("region-panel"), action: $("region-action"), radius: $("region-radius"), softness: $("region-softness"),
   scaled: $("region-scaled"), list: $("region-list"), remove: $("region-remove"),
   inputs: ["action", "radius", "softness", "stops", "color"].map((name) => $(`region-${name}`)),
 }, {
-  document: () => history.document,
-  preview: (change) => history.preview(change, "dragging"),
-  done: (change) => history.push(change),
+  ...edits,
   factor() {
     const tint = linear($("region-color").value), most = Math.max(...tint, 1e-3);
     return tint.map((v) => Number(((v / most) * 2 ** Number($("region-stops").value)).toPrecision(5)));
@@ -514,20 +515,22 @@ async function put(kind, file) {
   const answer = await fetch(`${kind}/${encodeURIComponent(file.name)}`, { method: "PUT", body: file });
   return [answer.ok, await answer.text()];
 }
-$("light-image").addEventListener("click", () => $("light-image-file").click());
-$("light-image-file").addEventListener("change", async () => {
-  const [file] = $("light-image-file").files, index = lights.chosen;
-  $("light-image-file").value = ""; // the same file may be chosen again
-  if (!file) return;
-  const [taken, text] = await put("image", file);
+// A button that asks for a file.
+function asksFor(id, act) {
+  const input = $(`${id}-file`);
+  $(id).addEventListener("click", () => input.click());
+  input.addEventListener("change", () => {
+    const [file] = input.files;
+    input.value = ""; // the same file may be chosen again
+    if (file) act(file);
+  });
+}
+asksFor("light-image", async (file) => {
+  const index = lights.chosen, [taken, text] = await put("image", file);
   if (taken) lights.edit(index, { shape: "image", image: text, aspect: undefined });
   else say(text);
 });
-$("look").addEventListener("click", () => $("look-file").click());
-$("look-file").addEventListener("change", async () => {
-  const [file] = $("look-file").files;
-  $("look-file").value = ""; // the same file may be chosen again
-  if (!file) return;
+asksFor("look", async (file) => {
   say("");
   connection.send({ type: "look", name: file.name, text: await file.text() });
 });

@@ -21,7 +21,6 @@ class Progress:
         self._terminal = self.stream.isatty()
         self._bar: tqdm | None = None
         self._stage = ""
-        self._first_update: tuple[int, float] | None = None  # what was done, and when
         self._last_line = 0.0
 
     def __enter__(self) -> Progress:
@@ -34,16 +33,12 @@ class Progress:
         """Begin a stage."""
         self._close()
         self._stage = text
-        self._first_update = None
         self._last_line = time.monotonic()
         if not self.quiet and not self._terminal:
             print(text, file=self.stream, flush=True)
 
     def update(self, done: int, total: int, text: str = "") -> None:
-        """Report that ``done`` of ``total`` parts of the stage are done.
-
-        Speed is counted from the first call of the stage: what resumes was not done in no time.
-        """
+        """Report that ``done`` of ``total`` parts of the stage are done."""
         if self.quiet:
             return
         if self._terminal:
@@ -60,12 +55,9 @@ class Progress:
             self._bar.update(done - self._bar.n)
             return
         now = time.monotonic()
-        self._first_update = self._first_update or (done, now)
         if now - self._last_line >= LINE_SECONDS:
             self._last_line = now
-            first_done, first_time = self._first_update
-            speed = f", {(done - first_done) / (now - first_time):.3g}/s" if done > first_done else ""
-            print(f"{self._stage}: {done}/{total}{speed} {text}".rstrip(), file=self.stream, flush=True)
+            print(f"{self._stage}: {done}/{total} {text}".rstrip(), file=self.stream, flush=True)
 
     def _close(self):
         if self._bar is not None:

@@ -219,7 +219,7 @@ def _determined(result):
     bar = parts.scale((f"{share:g}" for share in preview.INFLUENCE_RANGE), preview.RISING)
     figures = [parts.figure(pixels, preview.influence_caption(result.frozen), bar)]
     if result.posterior is not None and result.posterior.identified is not None:
-        pixels = preview.share_image(result.posterior.identified)
+        pixels = preview.colours(preview.RISING, result.posterior.identified)
         caption = "how well the rendering determines the brightness of the sky, smoothed over some 15 degrees"
         bar = parts.scale(("not at all", "fully"), preview.RISING)
         figures.append(parts.figure(pixels, caption, bar))

@@ -169,7 +169,7 @@ def difference_image(
         least = 0.01
     typical = float(np.percentile(np.abs(difference), 99.5))
     scale = _round_up(max(typical, least))
-    return _colours(DIVERGING, difference / scale / 2 + 0.5), scale
+    return colours(DIVERGING, difference / scale / 2 + 0.5), scale
 
 
 def _round_up(value):
@@ -178,9 +178,9 @@ def _round_up(value):
     return next(m * decade for m in (1, 2, 5, 10) if m * decade >= value * (1 - 1e-9))
 
 
-def _colours(scale, position):
-    """Return positions (...) on a scale of colours, cut to [0, 1], as (..., 3) uint8."""
-    place = np.clip(position, 0, 1) * (len(scale) - 1)
+def colours(scale: np.ndarray, position: np.ndarray) -> np.ndarray:
+    """Return positions (...) on a scale of colours (n, 3), cut to [0, 1], as (..., 3) uint8."""
+    place = np.clip(position.astype(np.float64), 0, 1) * (len(scale) - 1)
     channels = [np.interp(place, np.arange(len(scale)), scale[:, c]) for c in range(3)]
     return np.rint(np.stack(channels, axis=-1)).astype(np.uint8)
 
@@ -206,7 +206,7 @@ def influence_image(influence: np.ndarray, frozen: np.ndarray | None = None) -> 
     mean = influence.sum(dtype=np.float64) / (4 * np.pi)
     low, high = np.log10(INFLUENCE_RANGE)
     level = np.log10(np.maximum(per_solid_angle(influence) / max(mean, 1e-300), INFLUENCE_RANGE[0]))
-    pixels = share_image((level - low) / (high - low))
+    pixels = colours(RISING, (level - low) / (high - low))
     if frozen is not None:
         pixels[frozen] = UNKNOWN
     return pixels
@@ -218,11 +218,6 @@ def influence_caption(frozen: np.ndarray | None) -> str:
     if frozen is not None and frozen.any():
         caption += "; grey texels are not determined by this view and keep their original value"
     return caption
-
-
-def share_image(share: np.ndarray) -> np.ndarray:
-    """Draw shares from 0 to 1, (H, W), in colours from violet to yellow: (H, W, 3) uint8."""
-    return _colours(RISING, np.asarray(share, np.float64))
 
 
 def unreachable(reach: Reach) -> np.ndarray:

@@ -41,7 +41,8 @@ class Project:
 
     def configured(self, document: Document, start: str = "") -> config.Config:
         """Return the configuration that makes the map of a document; arguments as of :meth:`text`."""
-        return _resolved(self.text(document, start), self.folder)
+        settings = config.loads(self.text(document, start), self.folder, str(self.folder / NAME))
+        return replace(settings, output=_without(settings.output, dir=str(self.folder)))
 
     def text(self, document: Document, start: str = "") -> str:
         """Return ``painted.toml``: what was given, what was painted, and the solution that goes on from."""
@@ -108,11 +109,6 @@ class Project:
         """Write ``painted.toml``, whole or not at all; as of :meth:`text`; InputError if it cannot."""
         atomic_files.make_folder(self.folder)
         atomic_files.write_atomically(self.folder / NAME, self.text(document, start).encode())
-
-
-def _resolved(text, folder):
-    settings = config.loads(text, folder, str(folder / NAME))
-    return replace(settings, output=_without(settings.output, dir=str(folder)))
 
 
 def opened(name: str, envmap: str = "", preset: str | None = None, camera: str = "") -> Project:

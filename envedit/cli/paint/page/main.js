@@ -22,7 +22,7 @@ const displays = {
 const WORDS = { moving: "Moving", solving: "Solving", rendering: "Rendering", done: "Done" };
 const NAMES = { transport: "live", mitsuba: "path traced", saved: "saved" };
 const log = []; // of edits and frames, for measurements
-window.envedit = { log, displays, advise };
+window.envedit = { log, advise };
 
 // Tools that ask the server about a place of the rendering. Those with a sentence place a light by a click.
 const PICKS = {
@@ -208,7 +208,7 @@ const RECEIVED = {
       displays.render.draw();
     }
     if (message.state === "done") compare.again();
-    if (message.client === client && message.number) note({ status: message.number, of: message.frame, state: message.state, iterations: message.iterations, steps: message.steps });
+    if (message.client === client && message.number) note({ status: message.number, of: message.frame, state: message.state, steps: message.steps });
     state(message.state, message.text ?? told(message));
   },
   doing(message) { $("status").textContent = `${told(last)} · ${message.text}`; },

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from envedit import config
 from envedit.cli import run
-from envedit.cli.paint.protocol import ORIENTATION, Document
+from envedit.cli.paint.protocol import ORIENTATION, TABLES, Document
 from envedit.config import presets
 from envedit.core import array_cache, atomic_files, file_locks
 from envedit.core.errors import ConfigError, InputError
@@ -55,15 +55,12 @@ class Project:
         if "parameters" in given["scene"]:
             named = given["scene"]["parameters"]
             given["scene"]["parameters"] = {key: self._found(value) for key, value in named.items()}
-        own = {name: value for name in ORIENTATION if (value := getattr(document, name))}
-        given["input"] = {"envmap": settings.input.envmap} | given["input"] | own
-        if document.rest != settings.target.rest:
-            given["target"]["rest"] = document.rest
-        if document.freedom != settings.solve.freedom:
-            given["solve"]["freedom"] = document.freedom
-        given["optimizer"] = given["optimizer"] | ({"start": start} if start else {})
-        moved = {"exposure": document.exposure, "temperature": document.temperature}
-        given["output"] = given["output"] | {key: value for key, value in moved.items() if value}
+        given["input"] = {"envmap": settings.input.envmap} | given["input"]
+        for name, value in document.plain().items():
+            if name not in LISTS and value != getattr(Document, name):
+                given[TABLES[name]][name] = value
+        if start:
+            given["optimizer"]["start"] = start
         given["output"].pop("dir", None)
         lines = [
             f"# Painted with `envedit paint`; `envedit run {NAME}` makes the same map.",
@@ -126,16 +123,7 @@ def opened(name: str, envmap: str = "", preset: str | None = None, camera: str =
             f"{name}: got representation.kind {settings.representation.kind!r} and renderer.kind "
             f"{settings.renderer.kind!r}, expected layers and transport: paint solves with these"
         )
-    document = Document(
-        strokes=settings.target.strokes if settings.target.kind == "strokes" else (),
-        lights=settings.input.lights,
-        regions=settings.input.regions,
-        **{name: getattr(settings.input, name) for name in ORIENTATION},
-        exposure=settings.output.exposure,
-        temperature=settings.output.temperature,
-        rest=settings.target.rest,
-        freedom=settings.solve.freedom,
-    )
+    document = Document(**{name: getattr(getattr(settings, table), name) for name, table in TABLES.items()})
     if settings.target.kind == "photo":
         return _continued(_of_photo(settings, base))
     if file is not None and file.name == NAME:

@@ -14,15 +14,11 @@ from typing import Any
 import numpy as np
 
 from envedit.config.input_schema import Target
-from envedit.config.light_schema import LightList
 from envedit.config.method_schema import Solve
-from envedit.config.region_schema import RegionList
 from envedit.config.schema import FIELDS
-from envedit.config.stroke_schema import StrokeList
 from envedit.config.validators import (
     Choice,
     Integer,
-    Kelvin,
     Number,
     Numbers,
     String,
@@ -60,12 +56,7 @@ class BadMessageError(ValueError):
 
 @dataclass(frozen=True)
 class Document:
-    """What a user has done: all that is saved.
-
-    ``strokes``, ``lights`` and ``regions`` are as in ``[[target.strokes]]``, ``[[input.lights]]`` and
-    ``[[input.regions]]``, angles as in ``[input]``, ``exposure`` and ``temperature`` as in ``[output]``;
-    ``rest`` is of ``[target]``, ``freedom`` of ``[solve]``.
-    """
+    """What a user has done: all that is saved, keys of a configuration (:data:`TABLES`)."""
 
     strokes: tuple[dict, ...] = ()
     lights: tuple[dict, ...] = ()
@@ -93,30 +84,31 @@ class Document:
 
     def plain(self) -> dict:
         """Return it as JSON has it."""
-        return {name: getattr(self, name) for name in _CHECKS}
+        return {name: getattr(self, name) for name in TABLES}
 
 
-_CHECKS = {
-    "strokes": StrokeList(),
-    "lights": LightList(),
-    "regions": RegionList(),
-    **{name: FIELDS["input"][name].metadata["check"] for name in ORIENTATION},
-    "exposure": Number(-20, 20),
-    "temperature": Kelvin(),
-    "rest": Choice("follow", "keep"),
-    "freedom": Number(0, 1),
+TABLES = {
+    "strokes": "target",
+    "lights": "input",
+    "regions": "input",
+    **dict.fromkeys(ORIENTATION, "input"),
+    "exposure": "output",
+    "temperature": "output",
+    "rest": "target",
+    "freedom": "solve",
 }
+"""Keys of a document, and which table of a configuration has them."""
 
 
 def document(value: Any) -> Document:
     """Read a document; raises BadMessageError."""
-    if not isinstance(value, dict) or not value.keys() <= _CHECKS.keys():
-        raise BadMessageError(f"document: got {show(value)[:80]}, expected keys among {', '.join(_CHECKS)}")
+    if not isinstance(value, dict) or not value.keys() <= TABLES.keys():
+        raise BadMessageError(f"document: got {show(value)[:80]}, expected keys among {', '.join(TABLES)}")
     _check_counts(value.get("strokes"))
     found: dict[str, Any] = {}
     for name, given in value.items():
         try:
-            found[name] = _CHECKS[name](given)
+            found[name] = FIELDS[TABLES[name]][name].metadata["check"](given)
         except ConfigError as error:
             raise BadMessageError(str(error)) from None
         except WantedError as error:

@@ -28,7 +28,7 @@ import numpy as np
 from envedit import inputs, pipeline, renderers
 from envedit.cli.paint import advice, picking
 from envedit.cli.paint.project import MATCHED, SOLUTION, Project
-from envedit.cli.paint.protocol import ORIENTATION, Document, Edit, Pick
+from envedit.cli.paint.protocol import TABLES, Document, Edit, Pick
 from envedit.cli.paint.solution import COLUMNS, Solution
 from envedit.core import latlong
 from envedit.core.arrays import tensor
@@ -491,8 +491,8 @@ class Session:
         self._tell_doing("composing the map at the resolution of its file")
         if self._wide is None:
             self._wide = self.given.at_file_size(settings, SKY_WIDTH)
-        rotated = {name: getattr(document, name) for name in ORIENTATION}
-        by_hand = replace(settings, lights=document.lights, regions=document.regions, **rotated)
+        placed = {name: value for name, value in document.plain().items() if TABLES[name] == "input"}
+        by_hand = replace(settings, **placed)
         given = replace(self.given, placed=self.placed if document.lights or document.regions else None)
         solution = self.solution
         params = solution.problem.solution_params(solution.run.state)

@@ -118,6 +118,14 @@ def test_noise_of_paint_is_at_most_a_share_of_the_change_that_is_seen():
     assert nothing.noise(residual) == pytest.approx(PAINT_NOISE * VISIBLE)
 
 
+def test_paint_asks_about_what_it_covers_and_a_rendering_about_all():
+    one, coverage = of_stroke()
+    assert one.asked == pytest.approx(coverage.mean(), rel=1e-6)
+    all_painted = np.ones_like(coverage)
+    assert Likelihood.of_paint(all_painted, all_painted, *pictures(coverage)).asked == 1
+    assert Likelihood(one.weight).asked == 1
+
+
 @pytest.mark.parametrize(("before", "white"), [(0.0, 1.0), (0.2, 1.0), (4.0, 4.0)])
 def test_white_is_what_most_of_the_picture_was_below_and_at_least_one(before, white):
     coverage = np.zeros((*FILM, 1), np.float32)

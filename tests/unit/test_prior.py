@@ -106,10 +106,12 @@ def test_of_a_rendering_every_node_has_a_deviation_of_its_own():
         np.testing.assert_allclose(precision, np.diag((deviation / 2.0**level) ** -2), rtol=1e-12)
 
 
-def test_paint_is_no_reason_for_another_colour_of_a_light():
-    painted, rendered = prior.of_paint(0.25), Prior()
+@pytest.mark.parametrize(("share", "factor"), [(0.0, 0.25), (0.1, 0.25), (0.6, 0.6), (1.0, 1.0)])
+def test_paint_changes_the_colour_of_a_light_as_far_as_that_of_the_whole_sky(share, factor):
+    coverage = np.full((4, 5, 1), share)
+    painted, rendered = prior.of_paint(0.25, coverage), Prior()
     assert painted.freedom == 0.25 and rendered.freedom is None
-    change = np.array([[1, 1, 1], [1, 0, -1], [1, -2, 1]]) / 3
-    ratio = [c @ painted.flux_precision @ c / (c @ rendered.flux_precision @ c) for c in change]
-    assert ratio == pytest.approx([1, (rendered.flux_chroma / rendered.chroma * 3) ** 2, 9])
+    deviations = [np.diag(AXES @ one.flux_precision @ AXES.T) ** -0.5 for one in (painted, rendered)]
+    _, chroma, tint = (factor * skies.whole for skies in PHOTOGRAPHED)
+    np.testing.assert_allclose(deviations[0], [deviations[1][0], chroma, tint], rtol=1e-6)
     np.testing.assert_allclose(AXES @ AXES.T, np.eye(3), atol=1e-12)

@@ -55,7 +55,7 @@ class Found:
     """What a search, and the steps from what it found, make of a map and a picture."""
 
     def __init__(self, transport, image, wanted, weight=None):
-        layers = Layers.of(image[:ROWS], (0, HEIGHT))
+        layers = Layers.of(image[:ROWS], (0, HEIGHT), cycles=6)
         encoded = layers.start()
         likelihood = Likelihood(on_average_one(weight, wanted.shape[:2]))
         problem = Problem(layers, transport, image, wanted, likelihood, saturates=True)

@@ -14,7 +14,6 @@ import numpy as np
 from envedit.core import color, latlong
 from envedit.losses import losses, metrics, optimizer, ssim
 from envedit.representations.layers import lights
-from envedit.representations.siren import fit
 from envedit.representations.siren import network as siren
 from tests.oracles.extremes_stages import (
     LOSSES,
@@ -23,7 +22,6 @@ from tests.oracles.extremes_stages import (
     loss_and_gradient,
     plain,
     single,
-    sky,
     transport,
 )
 from tests.oracles.plain import IDENTICAL, plain_ssim
@@ -169,54 +167,7 @@ def _constant_ssim():
     return worst
 
 
-# ---- normalisation and the network -----------------------------------------------------------------------
-
-
-def _round_trip():
-    worst = 0.0
-    for m in (*wild(), np.geomspace(1e-5, 1e10, 512 * 3).astype(np.float32).reshape(16, 32, 3)):
-        normal = fit.Normalisation.of(m)
-        back = normal.decode(single(normal.encode(m))).numpy().astype(np.float64)
-        worst = max(worst, float((np.abs(back - m) / (m.astype(np.float64) + 0.01)).max()))
-    return worst
-
-
-def _ends():
-    worst = 0.0
-    for top in (1e-3, 1.0, 1e5, 1e10, 1e30):
-        m = sky()
-        m[0, 0], m[5, 9] = 0, top
-        normal = fit.Normalisation.of(m)
-        y = siren._sigmoid(mi.TensorXf(np.float32([-1e30, -1e3, 1e3, 1e30])))
-        assert y.numpy().tolist() == [0, 0, 1, 1]
-        low, _, _, high = normal.decode(y).numpy().astype(np.float64)
-        largest = float(m.max())
-        worst = max(worst, abs(low) / 0.01, abs(high - largest) / (largest + 0.01))
-    return worst
-
-
-def _zero_layer():
-    rng, worst = np.random.default_rng(11), 0.0
-    for scale in (0.0, *SCALES):
-        weights = {
-            "0.weight": rng.normal(size=(8, 3)),
-            "0.bias": np.zeros(8),
-            "1.weight": scale * rng.normal(size=(3, 8)),
-            "1.bias": np.zeros(3),
-        }
-        params = {name: single(value) for name, value in weights.items()}
-        perturbation = fit.Perturbation(params, 0.01)
-        perturbation.update(
-            {name: single(rng.normal(size=value.shape)) for name, value in weights.items()}, 1e-4
-        )
-        moved = perturbation.apply(params)["1.weight"].numpy().astype(np.float64)
-        before = params["1.weight"].numpy().astype(np.float64)
-        if scale == 0:
-            worst = max(worst, 0.0 if np.array_equal(moved, before) else math.inf)
-        else:
-            ratio = np.linalg.norm(moved - before) / np.linalg.norm(before)
-            worst = max(worst, abs(ratio / 0.01 - 1))
-    return worst
+# ---- Adam --------------------------------------------------------------------------------------------------
 
 
 def _adam():
@@ -304,11 +255,6 @@ CHECKS |= {
     "flux of a light that is shared out": Check(_flux, 1e-6, "1e-20 to 1e38"),
     # 1 - SSIM = (a - b)^2 / (a^2 + b^2 + C1); exactly 0 where they are equal.
     "SSIM of constant images": Check(_constant_ssim, 3e-6),
-    # Relative to E + 0.01: the exponent, up to 28, rounds at 1e-6.
-    "normalisation, there and back": Check(_round_trip, 1e-5, "1e-5 to 1e10"),
-    "Eq. 3 where the sigmoid is 0 and 1": Check(_ends, 2e-5, "1e-3 to 1e30"),
-    # Weight and offset differ by 1 / gamma; a layer of zeros keeps its bits.
-    "norm of a perturbation over gamma times the layer's": Check(_zero_layer, 1e-4),
     "30 steps of Adam": Check(_adam, 1e-6),
 }
 _METRICS = {

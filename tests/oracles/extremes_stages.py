@@ -1,7 +1,6 @@
 """What is done in a cell of the matrix of extremes: a map through one stage, compared with plain float64.
 
-A stage returns normally where all that it made is finite and correct, returns the names of what is not finite
-where that is seen by whoever comes next, and raises where the map is refused.
+A stage returns normally where all that it made is finite and correct, and raises where the map is refused.
 """
 
 import functools
@@ -15,10 +14,8 @@ import OpenEXR
 from envedit import config, representations
 from envedit.core import latlong
 from envedit.images import images
-from envedit.losses import losses, metrics, optimizer, ssim
-from envedit.losses.display_curve import to_display
+from envedit.losses import losses, metrics, ssim
 from envedit.representations.layers.layers import Layers
-from envedit.representations.siren import fit
 from envedit.scene import scene
 from envedit.solve import adam_loop, search
 from envedit.solve.map_problem import Problem
@@ -37,9 +34,9 @@ STEPS = 25
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a cell ends in: ``done``, ``seen`` (not finite, and shown as such) or ``refused``.
+    """What a cell ends in: ``done`` or ``refused``.
 
-    ``words`` are part of the refusal's message, or what is not finite; ``says`` is a sentence for people.
+    ``words`` are part of the refusal's message; ``says`` is a sentence for people.
     """
 
     kind: str
@@ -50,10 +47,6 @@ class Outcome:
 
 def refused(error, words, says=""):
     return Outcome("refused", says, error, words)
-
-
-def seen(words, says=""):
-    return Outcome("seen", says, None, words)
 
 
 DONE = Outcome("done")
@@ -150,25 +143,6 @@ def write(m, folder):
 # ---- functions of the map --------------------------------------------------------------------------------
 
 
-def normalise(m, folder):
-    """Eq. 1 maps to [0, 1], its ends exactly, and Eq. 2-3 back: within 2e-5 of the value and 1e-7."""
-    with np.errstate(invalid="ignore", over="ignore"):
-        found = fit.Normalisation.of(m)
-        if not np.isfinite([found.low, found.span]).all():
-            return ["range"]
-        values = found.encode(m)
-    logs = np.log(m.astype(np.float64) + 0.01)
-    flat = np.ptp(logs) <= 1e-4
-    assert (
-        abs(values.min() - (0.5 if flat else 0)) <= 1e-4 and abs(values.max() - (0.5 if flat else 1)) <= 1e-4
-    )
-    back = found.decode(single(values)).numpy()
-    assert np.isfinite(back).all() and (back >= 0).all()
-    most = np.exp(88.0)  # declared where it is reached, by 3e38 alone
-    np.testing.assert_allclose(back, np.minimum(m, most), rtol=2e-5, atol=1e-7)
-    return None
-
-
 def fitted(m, folder):
     """A few steps: finite weights, a map within the range that the network has, a loss that does not rise."""
     told = []
@@ -182,29 +156,6 @@ def fitted(m, folder):
     assert np.isfinite(got).all() and got.min() >= 0
     assert np.log(got.max(initial=0) + 0.01) <= normal.low + normal.span + 1e-3
     assert len(told) == 2 and np.isfinite(told).all() and told[1] <= told[0]
-
-
-def transported(m, folder):
-    """T E and T' y are float64's product with T, within 1e-5 of the light that is summed."""
-    height, width, _ = m.shape
-    traced = transport(height, width)
-    got = traced.apply(single(m)).numpy()
-    pulled = traced.adjoint(single(got)).numpy()
-    if not np.isfinite(m).all():
-        bad = ["picture"] if not np.isfinite(got).all() else []
-        return bad + (["adjoint"] if not np.isfinite(pulled).all() else [])
-    if (
-        width == 4096
-    ):  # too many columns to list: <T x, y> = <x, T' y>, and twice the map is twice the picture
-        wide = got.astype(np.float64)
-        close((wide * wide).sum(), (m * pulled.astype(np.float64)).sum(), 1e-5)
-        np.testing.assert_array_equal(traced.apply(single(2 * m)).numpy(), 2 * got)
-        return None
-    matrix, flat = dense(height, width), m.reshape(-1, 3).astype(np.float64)
-    for c in range(3):
-        close(got.reshape(-1, 3)[:, c], matrix[c] @ flat[:, c], 1e-5)
-        close(pulled.reshape(-1, 3)[:, c], matrix[c].T @ got.reshape(-1, 3)[:, c].astype(np.float64), 1e-5)
-    return None
 
 
 # ---- losses ----------------------------------------------------------------------------------------------
@@ -264,58 +215,7 @@ def ssim_rounding(x) -> float:
     return 1e-7 * float(np.abs(x).max()) / 0.03**2 / np.size(x)
 
 
-def display(m):
-    """Return the display values of a rendering through T, as the losses see them."""
-    height, width, _ = m.shape
-    if height < 3:
-        return np.asarray(to_display(single(m)).numpy())
-    return to_display(transport(height, width).apply(single(m))).numpy()
-
-
-def lost(m, folder):
-    """Values within 1e-5, gradients within 1e-4 of the largest; inputs as an edit or a fit passes them."""
-    before = sky(*m.shape[:2])
-    with np.errstate(all="ignore"):
-        normal = fit.Normalisation.of(m if np.isfinite(m).all() and (m >= 0).all() else before)
-        logs = [normal.encode(e).astype(np.float32) for e in (m, before)]
-        given = {name: (m, before) for name in ("hdr", "luminance", "l1", "tv", "change")}
-        given |= {name: (display(m), display(before)) for name in ("image_l1", "image_l2", "ssim")}
-        given |= {name: logs for name in ("log_mse", "log_ssim")}
-        assert given.keys() == LOSSES.keys()
-        seen = []
-        for name, (x, y) in given.items():
-            value, gradient = loss_and_gradient(name, x, y)
-            if not np.isfinite(value):
-                seen.append(name)
-                continue
-            wanted, slope = plain(name, x, y)
-            # 1e-8: what sqrt(d^2 + s^2) - s rounds by where few of many texels differ.
-            close(value, wanted, 1e-5, 1e-8)
-            close(gradient, slope, 1e-4, ssim_rounding(x) if "ssim" in name else 0)
-    return sorted(seen)
-
-
-# ---- optimiser and loop ----------------------------------------------------------------------------------
-
-
-def adam(m, folder):
-    """Three steps with the map as gradient: within 1e-5 of float64's; a refused step changes nothing."""
-    lr, (b1, b2), eps = 0.1, (0.9, 0.999), 1e-8
-    start = sky(*m.shape[:2])
-    one = optimizer.Adam({"x": single(start)}, lr)
-    p, g = start.astype(np.float64), m.astype(np.float64)
-    first, second = np.zeros(p.shape), np.zeros(p.shape)
-    for t in (1, 2, 3):
-        if not one.step({"x": single(m)}):
-            np.testing.assert_array_equal(one.params["x"].numpy(), start)
-            return ["step"]
-        first, second = b1 * first + (1 - b1) * g, b2 * second + (1 - b2) * g * g
-        p = p - lr * first / (1 - b1**t) / (np.sqrt(second / (1 - b2**t)) + eps)
-    close(one.params["x"].numpy(), p, 1e-5)
-    # Where the gradient is tiny its square underflows: the step is lr g / eps, in proportion.
-    tiny = np.abs(g) < 1e-19
-    close((one.params["x"].numpy() - start)[tiny], (p - start)[tiny], 1e-3, 1e-7) if tiny.any() else None
-    return None
+# ---- the loop --------------------------------------------------------------------------------------------
 
 
 def renderer(height, width):
@@ -337,7 +237,7 @@ def edited(m, folder):
     Where the turned map is the same map, not one bit changes in the loop.
     """
     height, width, _ = m.shape
-    made = Layers.of(m)
+    made = Layers.of(m, cycles=4)
     params = made.start()
     traced = renderer(height, width)
     turned = latlong.rotate(m, 90.0)
@@ -397,11 +297,7 @@ def judged(m, folder):
 
 STAGES = {
     "read": read,
-    "normalise": normalise,
     "fit": fitted,
-    "transport": transported,
-    "losses": lost,
-    "Adam": adam,
     "edit loop": edited,
     "write": write,
     "metrics": judged,

@@ -32,7 +32,6 @@ from tests.oracles.runs import HEIGHT, WIDTH, interrupting, merged, settings_of,
 pytestmark = pytest.mark.usefixtures("own_cache", "own_core")
 
 PIXELS = {"representation": {"kind": "pixels"}}
-ADAM = {"optimizer": {"iterations": 20, "kind": "adam"}}
 STROKES = [{"type": "light", "ellipse": [0.45, 0.4, 0.15, 0.15], "amount": 2.0}]
 PAINTED = {"target": {"spp": 16, "kind": "strokes", "strokes": STROKES}}
 
@@ -101,14 +100,13 @@ def plated(folder, picture, **tables):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["layers", "siren"])
-def test_texels_behind_the_only_surface_keep_their_value(kind, tmp_path, rng):
+def test_texels_behind_the_only_surface_keep_their_value(tmp_path, rng):
     """A plate that faces +x fills the picture: of the map it sees the half with x > 0."""
     picture = 0.2 * sky(rng, 32, 64) + 0.3
     images.write_exr(tmp_path / "brighter.exr", 2 * picture)
     settings = plated(
         tmp_path, picture, input={"rows": "all", "horizon": "free", "width": 64},
-        representation={"kind": kind, "hidden": 16, "depth": 1}, target={"file": "brighter.exr"},
+        representation={"kind": "siren", "hidden": 16, "depth": 1}, target={"file": "brighter.exr"},
         optimizer={"kind": "adam", "iterations": 5, "lr": 1e-2},
     )  # fmt: skip
     found = pipeline.run(settings)
@@ -228,7 +226,7 @@ def test_a_highlight_that_matte_ground_cannot_show_leaves_the_mean_of_the_rest(t
     """As bright as painted, the ground takes a sky that makes all of it bright; what is to stay stays."""
     spot = {"type": "light", "ellipse": [0.5, 0.4, 0.06, 0.06, 0.0], "amount": 3.0, "units": "fraction"}
     tables = {
-        "input": {"width": 64, "rows": "all"}, "scene": {"width": 48}, "output": {"spp": 64},
+        "input": {"width": 64, "rows": "all"}, "scene": {"width": 32}, "output": {"spp": 64},
         "renderer": {"spp": 64, "max_depth": 3}, "optimizer": {"iterations": 60},
     }  # fmt: skip
     picture = analytic_sky.sunsky(64, 240.0, 45.0)
@@ -298,7 +296,7 @@ def test_paint_that_asks_for_another_brightness_leaves_the_sky_its_colours():
     edits, towards = Path(__file__).parents[2] / "scenes" / "edits", {}
     for edit, outside in (("enhance_shadow", 0.05), ("warmer", 1.0)):
         tables = tomllib.loads((edits / f"{edit}.toml").read_text(encoding="utf-8"))
-        tables |= {"output": {"spp": 64}, "renderer": {"spp": 64}}
+        tables |= {"output": {"spp": 64}, "renderer": {"spp": 64}, "representation": {"cycles": 6}}
         tables["input"]["width"], tables["scene"] = 64, tables.get("scene", {}) | {"width": 48}
         found = pipeline.run(config.from_dict(tables)).metrics
         assert found["natural"]["colours_outside"] <= outside
@@ -307,13 +305,12 @@ def test_paint_that_asks_for_another_brightness_leaves_the_sky_its_colours():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("rows", [[10, 10], [3, 4]])
-def test_rows_that_fill_no_cell_of_the_block_transport_can_be_edited(rows, tmp_path, rng):
+def test_rows_that_fill_no_cell_of_the_block_transport_can_be_edited(tmp_path, rng):
+    rows = [10, 10]
     picture = (0.1 + 0.3 * rng.random((128, 256, 1)) * np.ones(3)).astype(np.float32)
     found = pipeline.run(settings_of(tmp_path, picture, input={"rows": rows, "width": 256}))
-    first, last = rows
     assert np.isfinite(found.envmap).all() and found.metrics["active_rows"] == rows
-    others = np.delete(np.arange(128), np.arange(first, last + 1))
+    others = np.delete(np.arange(128), 10)
     assert found.envmap[others].tobytes() == picture[others].tobytes()
 
 
@@ -412,7 +409,6 @@ SIREN = {"representation": {"kind": "siren", "hidden": 16, "depth": 1}}
 CASES = {
     "siren, columns": SIREN,
     "pixels, transport recorded afresh": PIXELS | {"renderer": {"spp": 32, "max_depth": 3, "refresh": 6}},
-    "layers, painted, columns": ADAM | PAINTED,
 }
 
 
@@ -665,16 +661,13 @@ def turned_world(tmp_path, rng, **tables):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["layers", "pixels"])
-def test_a_turned_sky_is_turned_back_to_the_bit(kind, tmp_path, rng):
-    kinds = {"turn": "auto", "kind": kind}
+def test_pixels_begin_with_the_turned_sky(tmp_path, rng):
+    kinds = {"turn": "auto", "kind": "pixels"}
     settings, picture = turned_world(tmp_path, rng, representation=kinds, optimizer={"iterations": 5})
     found = pipeline.run(settings)
     assert found.metrics["turn_degrees"] == pytest.approx(90) and found.found.turn_degrees == 90
     assert any("turned by 90" in line for line in found.notes)
     assert found.metrics["envmap"]["psnr"] > found.metrics["initial_envmap"]["psnr"] + 10
-    if kind == "layers":
-        assert found.envmap.tobytes() == latlong.rotate(picture, 90).tobytes()
     # Initial and edited map stand in the user's frame.
     assert found.maps["initial"].tobytes() == picture.tobytes()
 
@@ -698,7 +691,8 @@ def test_lights_before_are_those_of_the_file(tmp_path, rng):
 
 @pytest.mark.slow
 def test_a_sky_that_must_not_turn_does_not(tmp_path, rng):
-    settings, _ = turned_world(tmp_path, rng, representation={"turn": False}, optimizer={"iterations": 3})
+    kept = {"turn": False, "kind": "pixels"}
+    settings, _ = turned_world(tmp_path, rng, representation=kept, optimizer={"iterations": 3})
     found = pipeline.run(settings)
     assert found.metrics["turn_degrees"] == 0 and not any("turned by 90.00" in line for line in found.notes)
 
@@ -761,6 +755,8 @@ def test_noise_of_the_target_does_not_spoil_a_turn(tmp_path, rng):
     settings, picture = turned_world(tmp_path, rng, target={"spp": 4})
     found = pipeline.run(settings)
     assert found.envmap.tobytes() == latlong.rotate(picture, 90).tobytes()
+    assert found.metrics["turn_degrees"] == pytest.approx(90)
+    assert found.maps["initial"].tobytes() == picture.tobytes()
     assert any("the rest is noise, nothing else changed" in line for line in found.notes)
     assert f"dB before, {found.metrics['render']['psnr']:.1f} dB after 0 steps" in repr(found)
     # What remains is noise: the right map leaves as much.
@@ -778,7 +774,7 @@ def test_the_map_does_not_make_up_for_what_the_transport_misses(monkeypatch):
     settings = {
         "scene": {"file": "sphere", "width": 32},
         "renderer": {"spp": 16},
-        "representation": {"turn": False},
+        "representation": {"turn": False, "cycles": 6},
         "target": {"spp": 1024},
         "output": {"spp": 1024},
     }

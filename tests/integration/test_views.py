@@ -44,7 +44,7 @@ def settings_of(two, **tables):
         "input": {"envmap": "sunsky", "width": 64},
         "scene": {"file": str(two), "width": 40, "sensors": "all"},
         "target": {"rotate_degrees": 120.0},
-        "representation": {"turn": False},
+        "representation": {"turn": False, "cycles": 6},
     }
     return config.from_dict({"preset": "draft"} | runs.merged(given, tables), two.parent)
 

@@ -21,7 +21,7 @@ from envedit.solve.derivatives import NARROW_ANGLE
 from envedit.solve.gauss_newton import Run, solve
 from envedit.solve.likelihood import Likelihood, on_average_one
 from envedit.solve.map_problem import Problem
-from envedit.solve.prior import PHOTOGRAPHED, Prior, of_paint
+from envedit.solve.prior import Prior, of_paint
 from envedit.targets.pixel_weights import pixel_weight
 from tests.oracles.dense_transport import DenseTransport
 from tests.oracles.maps import angle
@@ -172,14 +172,13 @@ def test_gradient_is_that_of_finite_differences(case, sigma):
     assert_gradient(problem, start, state, sigma)
 
 
-@pytest.mark.parametrize("sigma", slow_but([0.02, 1.0], 0.02))
-def test_gradient_of_a_photograph_is_that_of_finite_differences(photographed, sigma):
+def test_gradient_of_a_photograph_is_that_of_finite_differences(photographed):
     problem, _, start, state = photographed
     clipped = problem.clipped
     residual = problem.evaluate(state).residual
     assert (residual[clipped] == 0).mean() == pytest.approx(0.5, abs=0.4) and (residual[~clipped] > 0).any()
     assert (residual[clipped] <= 0).all()
-    assert_gradient(problem, start, state, sigma)
+    assert_gradient(problem, start, state, 0.02)
 
 
 @pytest.mark.slow
@@ -368,17 +367,6 @@ def test_penalty_is_that_of_the_precision(case, prior, rng):
     spare = copy(start)
     spare["flux"][1], spare["turn"][1], spare["size"][1] = DARK + 0.3, 0.1, 0.2
     assert problem.penalty(start, start) == problem.penalty(spare, start) == 0
-
-
-def test_a_factor_of_the_whole_sky_is_cheap_where_nodes_go_together(case):
-    painted, start = of_prior(case, of_paint(0.5)), case[2]
-    whole, one = copy(start), copy(start)
-    first = sum(rows * columns for rows, columns in painted.sizes[:-1])
-    whole["gain"][first:] = 0.3
-    one["gain"][first + 10] = 0.3
-    factor = (np.sqrt(3) * 0.3 / (0.5 * PHOTOGRAPHED[0].whole)) ** 2
-    assert painted.penalty(whole, start) == pytest.approx(factor, rel=0.02)
-    assert painted.penalty(one, start) > 1.5 * factor  # of all nodes one alone costs more
 
 
 # ---- a problem of known solution ---------------------------------------------------------------------------
@@ -610,25 +598,16 @@ def test_a_target_that_is_there_already_changes_nothing(rng):
     np.testing.assert_allclose(last.edited, image, rtol=1e-5)
 
 
-def test_black_map_stays_black(rng):
-    problem, solution, last = extreme(
-        rng, np.zeros((*GRID, 3)), lambda t: np.full((*FILM, 3), 0.5, np.float32)
-    )
-    assert not last.edited.any() and not last.state["gain"].any()
-    np.testing.assert_allclose(solution.posterior.deviation, prior_deviation(problem), rtol=1e-4)
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("factor", [0.25, 4.0])
-def test_a_single_light_takes_its_flux(rng, factor):
+def test_a_single_light_takes_its_flux(rng):
     image = lamp()
-    problem, _, last = extreme(rng, image, lambda t: factor * shown(t, image))
-    np.testing.assert_allclose(last.state["flux"][0], np.log(factor), atol=0.1)
+    problem, _, last = extreme(rng, image, lambda t: 4 * shown(t, image))
+    np.testing.assert_allclose(last.state["flux"][0], np.log(4), atol=0.1)
     assert problem.shining(last.state) == [0]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("value", [0.0, 65504.0, 1e6, 1e30])
+@pytest.mark.parametrize("value", [0.0, 1e30])
 def test_targets_of_any_radiance(rng, value):
     image = clouds(rng) + lamp()
     problem, solution, last = extreme(rng, image, lambda t: np.full((*FILM, 3), value, np.float32))
@@ -637,9 +616,8 @@ def test_targets_of_any_radiance(rng, value):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("value", [1e6, 1e30])
-def test_maps_of_any_radiance(rng, value):
-    image = clouds(rng) + lamp(radiance=value)
+def test_maps_of_any_radiance(rng):
+    image = clouds(rng) + lamp(radiance=1e30)
     problem, solution, last = extreme(rng, image, lambda t: 2 * shown(t, image))
     assert np.abs(last.residual).mean() < 0.3
 
@@ -669,15 +647,6 @@ def test_pixels_that_nothing_explains_have_little_say(rng):
         np.median(np.abs(f.rendering.reshape(-1, 3)[clean] / bright.reshape(-1, 3)[clean] - 1)) for f in found
     ]
     assert error[0] < 0.01 and error[1] < 0.08
-
-
-@pytest.mark.parametrize("name, value", [("flux", np.nan), ("turn", np.inf)])
-def test_a_start_that_is_not_finite_is_refused(case, name, value):
-    problem, params, *_ = case
-    array = params[name].numpy().copy()
-    array.ravel()[0] = value
-    with pytest.raises(NumericalError, match="the initial map is not finite: check the input map"):
-        solve(problem, params | {name: mi.TensorXf(array)})
 
 
 def test_a_start_whose_rendering_is_not_finite_is_refused(rng):
@@ -737,7 +706,7 @@ def test_the_maps_light_moves_where_no_step_leads(rng):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("factor", [1.0, 0.9, 1.5])
+@pytest.mark.parametrize("factor", [1.0, 1.5])
 def test_no_light_is_added_or_moved_where_one_factor_makes_the_target(rng, factor):
     image, transport = clouds(rng) + lamp(), DenseTransport.random(rng, FILM, GRID)
     _, found, lit = searched(image, transport, np.float32(factor * shown(transport, image)))
@@ -745,7 +714,7 @@ def test_no_light_is_added_or_moved_where_one_factor_makes_the_target(rng, facto
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("errors", "stays"), [((1.0, 1.0), True), ((1.0, 0.97), True), ((1.0, 0.9), False)])
+@pytest.mark.parametrize(("errors", "stays"), [((1.0, 0.97), True), ((1.0, 0.9), False)])
 def test_a_near_start_stays_unless_path_tracing_says_that_the_solution_is_closer(rng, errors, stays):
     image, transport = clouds(rng), DenseTransport.random(rng, FILM, GRID)
     target = shown(transport, 1.3 * image) * np.exp(rng.normal(0, 0.3, (*FILM, 3)))

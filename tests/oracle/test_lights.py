@@ -179,7 +179,7 @@ def test_rotation_vector_between_equal_directions_is_zero(d):
 # ---- values ----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("columns", [1, -1, 7, 24, 47])
+@pytest.mark.parametrize("columns", [1, -1, 24])
 @pytest.mark.parametrize("top", [2, 11])
 def test_turn_by_whole_texels_is_a_roll(top, columns, rng):
     light = patch(rng, top, 44)
@@ -226,7 +226,7 @@ GOALS = [(math.pi / 2, 0.0), (-math.pi / 2, 0.0), (1.5, 2.0), (-1.5, -2.0), (0.0
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("top", [1, 3, 11, 20])
+@pytest.mark.parametrize("top", [1, 11])
 def test_flux_is_kept_anywhere_on_the_sphere(top, rng):
     """Low to high and back, across the seam, over a pole, at a pole."""
     light = patch(rng, top, 46)
@@ -247,15 +247,6 @@ def test_rows_that_are_not_wanted_lose_their_flux_and_nothing_else(rng):
             of_rows = dataclasses.replace(light, texels=light.texels - first * W)
             part = core(Lights([of_rows], (first, H), W), turn=turn, shape=(last - first, W))
             np.testing.assert_allclose(part, whole[first:last], rtol=1e-6, atol=1e-8)
-
-
-def test_light_of_rows_of_a_map_is_that_of_the_map(rng):
-    light = patch(rng, 8, 10)
-    part = Light(light.direction, light.texels - 5 * W, light.radiance, None)
-    turn = random_turn(rng)
-    whole = core(Lights([light], (0, H), W), turn=turn)
-    of_rows = core(Lights([part], (5, H), W), turn=turn, shape=(H - 5, W))
-    np.testing.assert_array_equal(whole[5:], of_rows)
 
 
 def test_a_spare_light_can_have_a_colour_that_no_light_has(rng):
@@ -550,38 +541,13 @@ def test_gradient_of_the_glow_is_the_finite_difference(rng):
         np.testing.assert_allclose(got, expected, atol=2e-3 * np.abs(expected).max())
 
 
-# ---- determinism, extremes -------------------------------------------------------------------------------
-
-
-def test_core_has_the_same_bits_every_time(rng):
-    light = patch(rng, 2, 20, rows=20, columns=24)
-    made = Lights([light], (0, H), W)
-    turn = random_turn(rng)
-    first = core(made, turn=turn)
-    for _ in range(5):
-        np.testing.assert_array_equal(core(made, turn=turn), first)
-    # In another order as well.
-    order = rng.permutation(len(light.texels))
-    other = Light(light.direction, light.texels[order], light.radiance[order], None)
-    np.testing.assert_array_equal(core(Lights([other], (0, H), W), turn=turn), first)
+# ---- what is not finite -----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["turn", "flux", "size"])
-@pytest.mark.parametrize("value", [np.nan])
-def test_what_is_not_finite_is_not_dropped(name, value, rng):
+def test_what_is_not_finite_is_not_dropped(name, rng):
     made = Lights([patch(rng, 4, 10), patch(rng, 15, 40)], (0, H), W)
     where = {"turn": np.zeros((2, 3)), "flux": np.zeros((2, 3)), "size": np.zeros((2, 1))}
     assert np.isfinite(core(made, **where)).all()
-    where[name][1, 0] = value
+    where[name][1, 0] = np.nan
     assert np.isnan(core(made, **where)).any()
-
-
-@pytest.mark.parametrize("peak", [1e-30, 1e-20, 1e-6, 65504.0, 1e6, 1e12])
-def test_core_of_any_exposure(peak, rng):
-    light = patch(rng, 6, 46, peak=peak)
-    made, expected = Lights([light], (0, H), W), image_of(light)
-    np.testing.assert_allclose(core(made), expected, atol=1e-6 * peak)
-    for _ in range(5):
-        np.testing.assert_allclose(
-            maps.flux(core(made, turn=random_turn(rng))), maps.flux(expected), rtol=1e-5
-        )

@@ -27,7 +27,6 @@ from tests.oracles.runs import TINY, call, changed, measured, names, pixels, set
 pytestmark = pytest.mark.usefixtures("isolated", "own_cache")
 
 TERMS = ("ssim", "luminance", "l1", "tv", "image_l1", "image_l2")
-BAD_VALUES = [math.nan, math.inf]
 
 
 class Hole(dr.CustomOp):
@@ -98,10 +97,9 @@ STAGES = ("map", "picture", "slope of map", "slope of picture", *TERMS, "dists")
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("value", BAD_VALUES)
 @pytest.mark.parametrize("stage", STAGES)
-def test_bad_steps_at_any_stage_are_counted_and_survived(stage, value, monkeypatch):
-    arguments, seen = spoiled(stage, {5, 6, 12}, value, monkeypatch), []
+def test_bad_steps_at_any_stage_are_counted_and_survived(stage, monkeypatch):
+    arguments, seen = spoiled(stage, {5, 6, 12}, math.nan, monkeypatch), []
     seen.append(arrays(arguments[1]))
     params, state = adam_loop.optimise(
         *arguments, after_step=lambda _, adam: seen.append(arrays(adam.params))
@@ -119,7 +117,7 @@ def test_bad_steps_at_any_stage_are_counted_and_survived(stage, value, monkeypat
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("stage", STAGES)
+@pytest.mark.parametrize("stage", ["map", "slope of picture"])
 def test_a_stage_that_stays_bad_ends_the_loop_with_the_last_good_parameters(stage, monkeypatch):
     arguments = spoiled(stage, range(5, 1000), math.nan, monkeypatch)
     adam, state = optimizer.Adam(arguments[1], 0.02, (0.9, arguments[-1].beta2)), adam_loop.State()
@@ -133,8 +131,7 @@ def test_a_stage_that_stays_bad_ends_the_loop_with_the_last_good_parameters(stag
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("value", BAD_VALUES)
-@pytest.mark.parametrize("part", ["_m", "_v"])
+@pytest.mark.parametrize(("part", "value"), [("_m", math.nan), ("_v", math.inf)])
 def test_moments_that_are_not_finite_reach_no_parameter(part, value):
     """One bad element, as a faulty memory makes it. An infinite v alone would give steps of zero for ever."""
     arguments, _ = case(np.random.default_rng(0), iterations=60)
@@ -281,10 +278,9 @@ def spoil_renderer(monkeypatch, steps):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["layers", "siren", "pixels", "log-pixels"])
-def test_bad_steps_are_told_in_metrics_and_history(kind, tmp_path, rng, monkeypatch, capsys):
+def test_bad_steps_are_told_in_metrics_and_history(tmp_path, rng, monkeypatch, capsys):
     spoil_renderer(monkeypatch, {1, 4})
-    path, out = world(tmp_path, rng, representation={"kind": kind}), tmp_path / "c_out"
+    path, out = world(tmp_path, rng, representation={"kind": "pixels"}), tmp_path / "c_out"
     assert call(path, "--quiet", *changed(optimizer__iterations=6, optimizer__kind="adam")) == 0
     assert measured(out)["non_finite_steps"] == 2 and measured(out)["iterations"] == 6
     lines = (out / "history.csv").read_text().splitlines()
@@ -307,9 +303,7 @@ def test_an_edit_that_stops_leaves_its_last_good_map(tmp_path, rng, monkeypatch,
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("kind", "iterations"), [("layers", 30), ("siren", 1), ("pixels", 1), ("pixels", 30), ("log-pixels", 1)]
-)
+@pytest.mark.parametrize(("kind", "iterations"), [("siren", 1), ("pixels", 1), ("pixels", 30)])
 def test_a_rate_that_leads_nowhere_is_blamed_and_leaves_the_first_map(
     kind, iterations, tmp_path, rng, capsys, recorded
 ):
@@ -325,33 +319,35 @@ def test_a_rate_that_leads_nowhere_is_blamed_and_leaves_the_first_map(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("stage", ["adjustment", "judged rendering", "metrics", "transport's error"])
-def test_what_fails_after_the_loop_leaves_the_map(stage, tmp_path, rng, monkeypatch, capsys):
-    path, out = world(tmp_path, rng, representation={"kind": "pixels"}), tmp_path / "c_out"
+def test_what_fails_after_the_loop_leaves_the_map(tmp_path, rng, monkeypatch, capsys):
+    path = world(tmp_path, rng, representation={"kind": "pixels"})
     assert call(path, "--quiet", "--out", tmp_path / "whole") == 0
     capsys.readouterr()
 
     def fails(*arguments, **keys):
-        raise NumericalError(f"{stage}: not finite at row 1, column 2")
+        raise NumericalError("not finite at row 1, column 2")
 
     sampled = scene.Scene.sampled
 
     def judged_fails(self, envmap, spp, seed, *rest):
         return fails() if seed == Seeds(0).judged else sampled(self, envmap, spp, seed, *rest)
 
-    if stage == "adjustment":
-        monkeypatch.setattr(pipeline.adjustments, "adjust", fails)
-    elif stage == "judged rendering":
-        monkeypatch.setattr(scene.Scene, "sampled", judged_fails)
-    elif stage == "metrics":
-        monkeypatch.setattr(pipeline.metrics, "compare", fails)
-    else:
-        monkeypatch.setattr(LightTransport, "coarse_error", fails)
-    assert call(path, "--quiet") == 5
-    said = capsys.readouterr().err
-    assert "row 1, column 2" in said and len(said.splitlines()) <= 2
-    assert pixels(out / "edited.exr").tobytes() == pixels(tmp_path / "whole" / "edited.exr").tobytes()
-    assert names(out) == {"edited.exr", "checkpoint.npz"}
+    for k, (owner, name, replacement) in enumerate(
+        (
+            (pipeline.adjustments, "adjust", fails),
+            (scene.Scene, "sampled", judged_fails),
+            (pipeline.metrics, "compare", fails),
+            (LightTransport, "coarse_error", fails),
+        )
+    ):
+        out = tmp_path / f"out-{k}"
+        with monkeypatch.context() as patch:
+            patch.setattr(owner, name, replacement)
+            assert call(path, "--quiet", "--out", out) == 5
+        said = capsys.readouterr().err
+        assert "row 1, column 2" in said and len(said.splitlines()) <= 2
+        assert pixels(out / "edited.exr").tobytes() == pixels(tmp_path / "whole" / "edited.exr").tobytes()
+        assert names(out) == {"edited.exr", "checkpoint.npz"}
 
 
 @pytest.mark.slow

@@ -148,14 +148,13 @@ def test_the_manifest_names_inputs_and_seed(done):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("rows, active", [("all", [0, 7]), ([2, 2], [2, 2])])
-def test_only_the_rows_asked_for_change(rows, active, tmp_path, rng):
+def test_only_the_rows_asked_for_change(tmp_path, rng):
     adam = {"kind": "adam", "iterations": 4}  # Gauss-Newton leaves a row be that changes nothing but noise
-    path = world(tmp_path, rng, **PIXELS, input={"envmap": "map.exr", "rows": rows}, optimizer=adam)
+    path = world(tmp_path, rng, **PIXELS, input={"envmap": "map.exr", "rows": [2, 2]}, optimizer=adam)
     assert call(path, "--quiet") == 0
     before, after = pixels(tmp_path / "map.exr"), pixels(tmp_path / "c_out" / "edited.exr")
     first, last = measured(tmp_path / "c_out")["active_rows"]
-    assert [first, last] == active
+    assert [first, last] == [2, 2]
     assert after[:first].tobytes() == before[:first].tobytes()
     assert after[last + 1 :].tobytes() == before[last + 1 :].tobytes()
     assert (after[first : last + 1] != before[first : last + 1]).any()
@@ -208,9 +207,8 @@ def test_the_judged_rendering_is_what_mitsuba_makes_of_the_written_file(tmp_path
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("value", [0.0, 1e-30])
-@pytest.mark.parametrize("kind", ["layers", "siren", "pixels", "log-pixels"])
-def test_a_map_without_light_is_edited_all_the_same(value, kind, tmp_path, rng, capsys):
+@pytest.mark.parametrize(("kind", "value"), [("layers", 0.0), ("siren", 1e-30), ("log-pixels", 0.0)])
+def test_a_map_without_light_is_edited_all_the_same(kind, value, tmp_path, rng, capsys):
     path = world(tmp_path, rng, representation={"kind": kind})
     images.write_exr(tmp_path / "map.exr", np.full((8, 16, 3), value, np.float32))
     assert call(path, "--quiet") == 0
@@ -219,7 +217,7 @@ def test_a_map_without_light_is_edited_all_the_same(value, kind, tmp_path, rng, 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("kind", "spp"), [("pixels", 16), ("pixels", "auto"), ("layers", 16)])
+@pytest.mark.parametrize(("kind", "spp"), [("pixels", "auto"), ("layers", 16)])
 def test_initial_rendering_and_result_are_judged_with_the_same_samples(kind, spp, tmp_path, rng):
     """So that a map in which nothing changes has the same score."""
     target = {"rotate_degrees": 90.0, "spp": 16}
@@ -326,15 +324,15 @@ def test_out_may_have_any_name(tmp_path, rng):
 def test_earlier_results_are_moved_and_never_lost(tmp_path, rng):
     path, out = world(tmp_path, rng, **PIXELS), tmp_path / "c_out"
     kept = []
-    for seed in range(3):
+    for seed in range(2):
         assert call(path, "--quiet", *changed(optimizer__iterations=1, seed=seed)) == 0
         kept.append({name: data for name, data in content(out).items() if not name.startswith("earlier-")})
     (out / "earlier-note").write_text("mine")
-    assert names(out) == FILES | INFLUENCE | {"earlier-1", "earlier-2", "earlier-note"}
-    assert content(out / "earlier-1") == kept[0] and content(out / "earlier-2") == kept[1]
+    assert names(out) == FILES | INFLUENCE | {"earlier-1", "earlier-note"}
+    assert content(out / "earlier-1") == kept[0]
     # What is not ours stays where it is.
     assert call(path, "--quiet", *changed(optimizer__iterations=1)) == 0
-    assert (out / "earlier-note").read_text() == "mine" and content(out / "earlier-3") == kept[2]
+    assert (out / "earlier-note").read_text() == "mine" and content(out / "earlier-2") == kept[1]
 
 
 @pytest.mark.slow
@@ -444,12 +442,11 @@ def test_a_changed_configuration_is_not_resumed(tmp_path, rng, capsys, monkeypat
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("during", ["rendering the result", "writing"])
-def test_an_interrupt_after_the_last_iteration_costs_none(during, tmp_path, rng, capsys, monkeypatch):
+def test_an_interrupt_after_the_last_iteration_costs_none(tmp_path, rng, capsys, monkeypatch):
     path, out = world(tmp_path, rng, **PIXELS), tmp_path / "c_out"
     assert call(path, "--quiet", "--out", tmp_path / "whole") == 0
     with monkeypatch.context() as patch:
-        patch.setattr(Progress, "stage", interrupting(during))
+        patch.setattr(Progress, "stage", interrupting("rendering the result"))
         assert call(path, "--quiet") == 130
     assert "--resume" in capsys.readouterr().err and "checkpoint.npz" in names(out)
     monkeypatch.setattr(LightTransport, "render", lambda self, envmap, step: 1 / 0)

@@ -39,7 +39,7 @@ def test_only_the_lamp_that_has_changed_changes(lamps, removed, added):
         "target": {"spp": 128},
         "output": {"spp": 64},
         "renderer": {"spp": 128},
-        "representation": {"turn": False},
+        "representation": {"turn": False, "cycles": 6},
     }
     found = envedit.edit(settings, envmap=room(LAMPS), target_map=room(lamps)).lights
     after = {light["id"]: light for light in found["after"]}

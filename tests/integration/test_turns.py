@@ -49,17 +49,17 @@ def write_torus(path, around=48, across=24, radius=0.4):
     path.write_text("\n".join(lines) + "\n")
 
 
-@pytest.mark.parametrize("degrees", [75.0, 250.0])
-def test_a_turn_seen_through_rough_glass_is_found_and_not_spoiled(degrees, rng, tmp_path):
+def test_a_turn_seen_through_rough_glass_is_found_and_not_spoiled(rng, tmp_path):
     """The target's noise is larger than what most of its pixels say of the turn."""
     write_torus(tmp_path / "torus.obj")
     settings = {
         "scene": {"file": str(write_scene(tmp_path, TORUS, name="torus.xml")), "width": 32},
-        "target": {"rotate_degrees": degrees, "spp": 64},
+        "target": {"rotate_degrees": 250, "spp": 64},
         "output": {"spp": 64},
+        "representation": {"cycles": 6},
     }
     found = envedit.edit(settings, envmap=cloudy_sky(rng)).metrics
-    assert found["turn_degrees"] == pytest.approx(degrees, abs=2)  # a third of a texel
+    assert found["turn_degrees"] == pytest.approx(250, abs=2)  # a third of a texel
     assert found["envmap"]["psnr"] > found["initial_envmap"]["psnr"] + 10
 
 
@@ -72,6 +72,7 @@ def test_turns_of_one_run_after_another_add_up(rng, tmp_path):
         "scene": {"file": "sphere", "width": 32},
         "target": {"rotate_degrees": 30, "spp": 64},
         "output": {"spp": 16, "report": False},
+        "representation": {"cycles": 6},
     }
     turned = []
     for k in range(2):

@@ -135,17 +135,6 @@ def test_predicted_error_is_the_error_within_a_factor(matte, wanted, rng, kind, 
 # ---- bias --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
-def test_the_mean_of_many_recordings_has_no_error_that_stays(matte, wanted):
-    # Independent and unbiased: the error of the mean of K falls as K^(-1/2), measured -0.51, 5.9 % to 0.70 %.
-    # A bias would stay: one of 1 % would make the last 1.2 %.
-    image, counts = smooth_sky(), (1, 4, 16, 64)
-    pictures = np.stack([picture(build(matte, spp=16, seed=seed), image) for seed in range(64)]).astype(float)
-    errors = [rmse(pictures.reshape(-1, k, *wanted.shape).mean(axis=1), wanted) for k in counts]
-    assert -0.56 < slope(counts, errors) < -0.47
-    assert errors[-1] < 1.15 * errors[0] / 8
-
-
 def z_scores(pictures, theirs, size=4):
     """Tell errors of stored pictures (K, h, w, 3) in blocks, over their own and the reference's noise."""
 

@@ -14,7 +14,6 @@ from envedit.transport.sampling_plan import COLUMN_PATHS, FEW_PATHS, FEW_TOLERAN
 from tests.oracles.kernels import compiled
 from tests.oracles.plain import lookup
 from tests.oracles.scenes import (
-    DEPTH,
     HEIGHT,
     LAMP,
     METAL,
@@ -51,10 +50,6 @@ SUNS = {
 }
 EVERY_SUN = ("turned and cropped", "in the air")
 SUNS_BELOW = {"below the horizon": (HEIGHT // 2, 22), "the lower pole": (HEIGHT - 1, 5)}
-MAPS = {
-    "sunny sky": "puresky/kloofendal_48d_partly_cloudy_puresky_1k.hdr",
-    "city": "hdri/venice_sunset_1k.hdr",
-}
 
 
 # ---- Mitsuba's pictures ------------------------------------------------------------------------------------
@@ -123,33 +118,19 @@ def test_pictures_are_those_of_mitsuba(recorded):
 
 # Other shapes, films and frames have no say in what a real map has beyond noise and a sun.
 @pytest.mark.slow
-@pytest.mark.parametrize("recorded", ["sphere", "mirror", "glass"], indirect=True)
+@pytest.mark.parametrize("recorded", ["sphere", "mirror"], indirect=True)
 def test_pictures_under_a_real_map_are_those_of_mitsuba(recorded, data):
-    name, s, transports = recorded
-    for file in ("sunny sky", "city") if name == "pair" else ("sunny sky",):
-        image, _ = load_envmap(data / MAPS[file], WIDTH)
-        assert all(1 <= t.resolve(image, limit=8) <= 8 for t in transports)  # both tiers take part
-        ours, theirs = np.stack([picture(t, image) for t in transports]), references(s, image, spp=128)
-        assert disagreement(ours, theirs) == "", file
-        assert disagreement(1.03 * ours, theirs) != "", file  # negative control
-
-
-@pytest.mark.slow
-def test_exact_columns_of_the_whole_map_give_the_picture():
-    s, image = load("red wall and a lamp"), noise(1, 4, 8)
-    transports = [build(s, 4, 8, seed=seed) for seed in range(SEEDS)]
-    for t in transports:
-        t.resolve(image, tolerance=0)
-        # What cannot matter needs no column, and the last one alone has no variance.
-        assert len(t.columns) >= np.count_nonzero(t.influence) - 1
-    ours, theirs = np.stack([picture(t, image) for t in transports]), references(s, image)
+    _, s, transports = recorded
+    image, _ = load_envmap(data / "puresky/kloofendal_48d_partly_cloudy_puresky_1k.hdr", WIDTH)
+    assert all(1 <= t.resolve(image, limit=8) <= 8 for t in transports)  # both tiers take part
+    ours, theirs = np.stack([picture(t, image) for t in transports]), references(s, image, spp=128)
     assert disagreement(ours, theirs) == ""
-    assert disagreement(1.01 * ours, theirs) != ""  # negative control
+    assert disagreement(1.03 * ours, theirs) != ""  # negative control
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("depth", [2, 3])
-def test_depth_means_what_it_means_to_mitsuba(depth):
+def test_depth_means_what_it_means_to_mitsuba():
+    depth = 3
     film = {"width": 24, "height": 24}
     # Low and level, so that the sky is in view; the light of the lamp is cut at the same depth.
     s = scene.load(stage(ball(WHITE), WALL, LAMP, film=film, origin=(0, 1.2, 7)))
@@ -179,11 +160,10 @@ def test_sky_seen_directly_converges_with_every_seed():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("row, column", [(0, 3), (4, WIDTH - 1)])
-def test_plane_under_one_texel_receives_its_irradiance(row, column):
+def test_plane_under_one_texel_receives_its_irradiance():
     # I = albedo / pi * integral of cos(theta) times the texel's tent over the upper hemisphere.
     image = np.zeros((HEIGHT, WIDTH, 3), np.float32)
-    image[row, column] = (1e5, 2e5, 3e5)
+    image[0, 3] = (1e5, 2e5, 3e5)
     v = (np.arange(1500) + 0.5) / 3000  # midpoints; the error is of the order of the step squared
     phi = 2 * np.pi * (np.arange(640) + 0.5) / 640
     theta = np.pi * v[:, None]
@@ -200,9 +180,8 @@ def test_plane_under_one_texel_receives_its_irradiance(row, column):
         ours.append(picture(t, image))
     ours = np.stack(ours)
     assert disagreement(ours, np.broadcast_to(expected, ours.shape), sizes=(4, 0)) == ""
-    # Negative control; at grazing incidence half the tent is below the plane, and the noise is larger.
-    wrong = 1.1 if row == 8 else 1.01
-    assert disagreement(wrong * ours, np.broadcast_to(expected, ours.shape), sizes=(0,)) != ""
+    # Negative control.
+    assert disagreement(1.01 * ours, np.broadcast_to(expected, ours.shape), sizes=(0,)) != ""
 
 
 @pytest.mark.slow
@@ -466,16 +445,6 @@ def test_probing_a_texel_that_has_a_better_column_keeps_it(lamp_scene):
     columns = t.probe(texels)
     np.testing.assert_array_equal(columns[0].reshape(better.shape), better)
     assert t._exact.paths_of[texels].tolist() == [COLUMN_PATHS[-1], COLUMN_PATHS[0]]
-
-
-@pytest.mark.slow
-def test_probes_are_mitsubas_pictures_of_one_texel(lamp_scene):
-    image, depth = 100 * one_hot(4 * WIDTH + 12), {"max_depth": DEPTH}
-    lamp = np.stack([lamp_scene.render(black(), spp=2048, seed=k, **depth) for k in range(2)]).mean(axis=0)
-    lit = np.stack([lamp_scene.render(refined(image), spp=2048, seed=9 + k, **depth) for k in range(2)])
-    theirs = (lit.mean(axis=0) - lamp).mean(axis=(0, 1))
-    ours = 100 * build(lamp_scene, spp=4).probe(np.array([4 * WIDTH + 12]))[0].mean(axis=0)
-    np.testing.assert_allclose(ours, theirs, rtol=0.05)
 
 
 @pytest.mark.slow

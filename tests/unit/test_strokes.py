@@ -61,14 +61,6 @@ def test_the_area_covered_is_that_of_the_shape_at_any_resolution(shape, area, si
     assert covered(size, **shape).mean() == pytest.approx(area, rel=5e-4)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("softness", [0.01, 0.1])
-@pytest.mark.parametrize("shape", [shape for shape, _ in AREAS])
-def test_soft_shapes_cover_the_same_share_at_any_resolution(shape, softness):
-    small, large = (covered(size, softness=softness, **shape).mean() for size in (128, 512))
-    assert small == pytest.approx(large, rel=1e-3)
-
-
 def test_a_picture_made_small_is_the_small_picture_and_hairlines_keep_their_share():
     for shape, _ in AREAS:
         fine = covered(512, softness=0.03, **shape).reshape(128, 4, 128, 4).mean(axis=(1, 3))

@@ -277,7 +277,7 @@ def test_a_setting_sun_without_blue_is_replaced_by_a_white_one(tmp_path):
     images.write_exr(tmp_path / "day.exr", made(8, 20, [2000, 1900, 1800], [0.3, 0.4, 0.6]))
     settings = settings_of(
         tmp_path, made(14, 40, [200, 30, 0], [0.4, 0.35, 0.3]), input={"width": 64, "rows": "all"},
-        target={"file": "day.exr", "rotate_degrees": 0.0, "spp": 256}, scene={"file": "pair", "width": 32},
+        target={"file": "day.exr", "rotate_degrees": 0.0, "spp": 256}, scene={"file": "pair", "width": 20},
         renderer={"spp": 64}, representation={"turn": False}, output={"spp": 256},
         optimizer={"iterations": 60},
     )  # fmt: skip

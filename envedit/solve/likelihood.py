@@ -103,11 +103,9 @@ class Likelihood:
         return self.paint_noise is None
 
     @property
-    def asked(self) -> float:
-        """Share of the picture that the target is about: all of a rendering, of paint what it covers."""
-        if self.rest is None:
-            return 1.0
-        return 1 - float(self.rest.sum(dtype=np.float64)) / np.count_nonzero(self.weight)
+    def of_most(self) -> bool:
+        """Whether the target is about most of the picture: a rendering is, paint where it covers so much."""
+        return self.rest is None or 2 * self.rest.sum(dtype=np.float64) < np.count_nonzero(self.weight)
 
     @property
     def area(self) -> float:

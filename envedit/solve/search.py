@@ -162,12 +162,12 @@ def _neighbours(problem, best, moves, after_step, steps, sky):
 
 
 def _cost_of_place(problem: Problem) -> float:
-    """Return what a light's place costs that was looked for: it could be in any cell.
+    """Return what a light's place costs that was looked for: of most of a picture it could be in any cell.
 
-    Of what was not painted nothing is asked, and a light that it would not fit is not ruled out by it.
+    Paint on a part of it is a statement about lights: they move first.
     """
     _, directions = problem.blocks.sky
-    return 2 * np.log(max(len(directions), 1)) * problem.likelihood.asked
+    return 2 * np.log(max(len(directions), 1)) * problem.likelihood.of_most
 
 
 def _cost_of_choice(problem: Problem) -> float:

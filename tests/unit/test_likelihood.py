@@ -118,12 +118,14 @@ def test_noise_of_paint_is_at_most_a_share_of_the_change_that_is_seen():
     assert nothing.noise(residual) == pytest.approx(PAINT_NOISE * VISIBLE)
 
 
-def test_paint_asks_about_what_it_covers_and_a_rendering_about_all():
+def test_a_rendering_is_of_most_of_the_picture_and_paint_where_it_covers_so_much():
     one, coverage = of_stroke()
-    assert one.asked == pytest.approx(coverage.mean(), rel=1e-6)
-    all_painted = np.ones_like(coverage)
-    assert Likelihood.of_paint(all_painted, all_painted, *pictures(coverage)).asked == 1
-    assert Likelihood(one.weight).asked == 1
+    assert coverage.mean() < 0.5 and not one.of_most and Likelihood(one.weight).of_most
+    weight = np.ones_like(coverage)
+    for rows, of_most in ((FILM[0] // 2 - 1, False), (FILM[0] // 2 + 1, True), (FILM[0], True)):
+        painted = np.zeros_like(coverage)
+        painted[:rows] = 1
+        assert Likelihood.of_paint(weight, painted, *pictures(painted)).of_most == of_most
 
 
 @pytest.mark.parametrize(("before", "white"), [(0.0, 1.0), (0.2, 1.0), (4.0, 4.0)])

@@ -99,18 +99,15 @@ def search(
     best = _descended(problem, {}, gauss_newton.Run(start, start), steps)
     cleared = {name: np.zeros_like(start[name]) for name in ("gain", "saturation")}
     compared: list[Explanation] = [best]
-    settled = best.point.residual is None
-    while not settled:
+    better = best if best.point.residual is not None else None
+    while better:
+        best = better
         moves = _moves(problem, best)
         kinds = _best_kinds(moves) if len(compared) == 1 and _unfollowed(problem, best) else ()
         promising = [move for move in moves if move.gain > 0 or (move.light, move.what) in kinds]
         neighbours = _neighbours(problem, best, promising, after_step, steps, cleared)
         compared += neighbours
         better = _likelier(best, neighbours)
-        # A light that moves again by next to nothing has found its place.
-        little = better is not None and best.score - better.score < POSITIVE_EVIDENCE
-        settled = better is None or (little and better.name == best.name)
-        best = better or best
     return replace(best, others=_others(best, compared))
 
 

@@ -47,8 +47,8 @@ def illuminating(scene: Scene, view: int, x: float, y: float) -> np.ndarray:
     It maximises cos(angle to the normal) times the share of directions within :data:`CLEARANCE_DEGREES` in
     which no object stands: the shading normal, where nothing is in the way.
 
-    NoPlaceError if no surface is seen there, it only reflects as a
-    mirror, or no part of the map is seen from it.
+    NoPlaceError if no surface is seen there, it only reflects as a mirror, or no part of the map is seen from
+    it.
     """
     surface, normal, _ = _surface_at(scene, view, x, y)
     scatters = int(mi.BSDFFlags.Diffuse | mi.BSDFFlags.Glossy)
@@ -69,8 +69,7 @@ def rimming(scene: Scene, view: int, x: float, y: float) -> np.ndarray:
     tangent plane: what lies between the place and the silhouette faces the light. It is the direction closest
     to that behind the place with no object within :data:`CLEARANCE_DEGREES`, such as a floor.
 
-    NoPlaceError if no surface is seen there, it faces the camera,
-    or objects are in the way.
+    NoPlaceError if no surface is seen there, it faces the camera, or objects are in the way.
     """
     surface, normal, eye = _surface_at(scene, view, x, y)
     grazing = np.radians(GRAZING_DEGREES)
@@ -93,8 +92,7 @@ def shading(scene: Scene, view: int, x: float, y: float, light: np.ndarray | Non
     where nothing fills all, it is the one closest to ``light`` (3,), where the light stands in the frame of
     the map; without it the one closest to the normal.
 
-    NoPlaceError if no surface is seen there, or no object stands
-    above it.
+    NoPlaceError if no surface is seen there, or no object stands above it.
     """
     surface, normal, _ = _surface_at(scene, view, x, y, smooth=False)  # facets do not shade one another
     toward = _hemisphere(normal)
@@ -117,8 +115,7 @@ def highlighting(scene: Scene, view: int, x: float, y: float) -> np.ndarray:
     specular surfaces alone the light itself. The result is the mean of the directions that show at least
     half as much as the best one.
 
-    NoPlaceError if what is seen there is not glossy, or reflects
-    mostly another object.
+    NoPlaceError if what is seen there is not glossy, or reflects mostly another object.
     """
     value, specular, bounces, leaves, toward = _followed(scene, view, x, y)
     reflected = bounces > 0

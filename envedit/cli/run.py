@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 from envedit.cli import doctor, run_options
 from envedit.cli.console import Console, exit_code
 from envedit.cli.streams import steady
-from envedit.core import interrupts, shipped
+from envedit.core import shipped
 from envedit.core.errors import ConfigError, InputError
 
 if TYPE_CHECKING:
@@ -101,7 +101,7 @@ def _run(arguments, console, begun):
         return _dry_run(settings, base, console)
 
     # ---- The edit
-    interrupts.import_mitsuba()
+    doctor.select(settings.variant)
     folder = Path(settings.output.dir)
     with output_folder.alone(folder):
         read = output_folder.inputs_of(settings, base)
@@ -118,7 +118,6 @@ def _run(arguments, console, begun):
 
 def _edit(settings, base, budget, resume, console, begun):
     """Carry out an edit and leave its results in its folder, in which nobody else works."""
-    doctor.select(settings.variant)
     from envedit import pipeline
 
     folder = Path(settings.output.dir)

@@ -75,7 +75,8 @@ def changed(**keys):
 
 
 def names(folder):
-    return {path.name for path in folder.iterdir()}
+    """Return the names of what a folder holds; a run that fails before it writes leaves none."""
+    return {path.name for path in folder.iterdir()} if folder.exists() else set()
 
 
 def content(folder):

@@ -103,11 +103,6 @@ class Likelihood:
         return self.paint_noise is None
 
     @property
-    def of_most(self) -> bool:
-        """Whether the target is about most of the picture: a rendering is, paint where it covers so much."""
-        return self.rest is None or 2 * self.rest.sum(dtype=np.float64) < np.count_nonzero(self.weight)
-
-    @property
     def area(self) -> float:
         """Pixels whose errors go together, A; at least one."""
         return max(1.0, self.weight.size / self.independent)

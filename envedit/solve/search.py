@@ -162,12 +162,9 @@ def _neighbours(problem, best, moves, after_step, steps, sky):
 
 
 def _cost_of_place(problem: Problem) -> float:
-    """Return what a light's place costs that was looked for: of most of a picture it could be in any cell.
-
-    Paint on a part of it is a statement about lights: they move first.
-    """
+    """Return what a light's place costs that was looked for: of a rendering it could be in any cell."""
     _, directions = problem.blocks.sky
-    return 2 * np.log(max(len(directions), 1)) * problem.likelihood.of_most
+    return 2 * np.log(max(len(directions), 1)) * problem.likelihood.robust
 
 
 def _cost_of_choice(problem: Problem) -> float:

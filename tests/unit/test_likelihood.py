@@ -118,16 +118,6 @@ def test_noise_of_paint_is_at_most_a_share_of_the_change_that_is_seen():
     assert nothing.noise(residual) == pytest.approx(PAINT_NOISE * VISIBLE)
 
 
-def test_a_rendering_is_of_most_of_the_picture_and_paint_where_it_covers_so_much():
-    one, coverage = of_stroke()
-    assert coverage.mean() < 0.5 and not one.of_most and Likelihood(one.weight).of_most
-    weight = np.ones_like(coverage)
-    for rows, of_most in ((FILM[0] // 2 - 1, False), (FILM[0] // 2 + 1, True), (FILM[0], True)):
-        painted = np.zeros_like(coverage)
-        painted[:rows] = 1
-        assert Likelihood.of_paint(weight, painted, *pictures(painted)).of_most == of_most
-
-
 @pytest.mark.parametrize(("before", "white"), [(0.0, 1.0), (0.2, 1.0), (4.0, 4.0)])
 def test_white_is_what_most_of_the_picture_was_below_and_at_least_one(before, white):
     coverage = np.zeros((*FILM, 1), np.float32)

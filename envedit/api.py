@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from os import PathLike
@@ -97,7 +98,7 @@ def edit(
         raise ConfigError("target, target_map: got both, expected one: a picture, or a map to render under")
     named = {"envmap": envmap, "target": target, "mask": mask, "target_map": target_map}
     arrays = {name: _array(name, value) for name, value in named.items() if value is not None}
-    warnings = [_warning_of_codes(name, named[name]) for name in arrays if name != "mask"]
+    of_codes = [_warning_of_codes(name, named[name]) for name in arrays if name != "mask"]
     chosen, folder = _settings(settings)
     base = base or folder
     mi.set_variant(chosen.variant)
@@ -118,8 +119,7 @@ def edit(
             mask=arrays.get("mask"),
         )
         result = run(_of_arrays(chosen, arrays), base=base, watch=watch, memory=memory)
-    if any(warnings):
-        result.warnings[:0] = filter(None, warnings)
+    result.warnings[:0] = filter(None, of_codes)
     return result
 
 
@@ -240,6 +240,11 @@ def load_map(file: str | PathLike[str], width: int | None = None) -> np.ndarray:
     ndarray (width / 2, width, 3) float32
         Linear radiance in Rec. 709, finite and not negative; row 0 is the zenith.
 
+    Warns
+    -----
+    UserWarning
+        The map is odd but usable: a negative texel that is set to 0, a light cut at 65504.
+
     Raises
     ------
     InputError
@@ -247,7 +252,10 @@ def load_map(file: str | PathLike[str], width: int | None = None) -> np.ndarray:
     ConfigError
         ``width`` is odd or out of range.
     """
-    return images.load_envmap(file, width)[0]
+    envmap, info = images.load_envmap(file, width)
+    for line in info["warnings"]:
+        warnings.warn(f"{info['path']}: {line}", stacklevel=2)
+    return envmap
 
 
 def sunsky(

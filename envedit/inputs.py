@@ -227,7 +227,7 @@ def read_file(source: str | np.ndarray, width: int | None, settings: config.Inpu
     )
     array = source if isinstance(source, np.ndarray) else None
     name = images.ARRAY if isinstance(source, np.ndarray) else source
-    warnings = [*info["warnings"]]
+    warnings = [f"{info['path']}: {line}" for line in info["warnings"]]
     space = info["chromaticities"]
     half = info.get("half", False)
     input_map = InputMap(name, stored, scale, info["size"], warnings, space, array=array, half=half)
@@ -236,8 +236,9 @@ def read_file(source: str | np.ndarray, width: int | None, settings: config.Inpu
     if input_map.outside > 0:
         space = primaries.name_of(input_map.chromaticities)
         warnings.append(
-            f"{100 * input_map.outside:.2g} % of its texels have colours of {space} outside Rec. 709: "
-            "their negative channels are set to 0 while editing; unedited texels keep their colour"
+            f"{info['path']}: {100 * input_map.outside:.2g} % of its texels have colours of {space} "
+            "outside Rec. 709: their negative channels are set to 0 while editing; "
+            "unedited texels keep their colour"
         )
     return input_map
 

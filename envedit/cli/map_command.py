@@ -92,7 +92,7 @@ def read(path: str, arguments: argparse.Namespace, console: Console) -> InputMap
 
     input_map = map_file.read(path, arguments.repair)
     for warning in input_map.warnings:
-        console.warn(f"{path}: {warning}")
+        console.warn(warning)
     return input_map
 
 

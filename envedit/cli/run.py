@@ -52,9 +52,10 @@ def load(name: str, preset: str | None, overrides: Iterable[str]) -> tuple[confi
 
     if run_options.is_scene(name):
         file = Path(name)
-        overrides = [f"scene.file={config.quote(name)}", *overrides]
-        label = str(file.with_name(f"{scene_name(file)}.toml"))  # its stem names the folder of results
-        return config.loads("", Path.cwd(), label, preset, overrides), None, Path.cwd()
+        results = f"{scene_name(file)}_out"
+        by_default = [f"scene.file={config.quote(name)}", f"output.dir={config.quote(results)}"]
+        overrides = [*by_default, *overrides]
+        return config.loads("", Path.cwd(), "command line", preset, overrides), None, Path.cwd()
     by_name = None if os.path.isfile(name) else shipped.configuration(name)
     file = by_name or Path(name)
     try:

@@ -103,6 +103,11 @@ class Likelihood:
         return self.paint_noise is None
 
     @property
+    def largest_noise(self) -> float:
+        """Largest standard error of display values: of paint, what is meant to no more than this."""
+        return np.inf if self.paint_noise is None else max(self.least_noise, self.paint_noise)
+
+    @property
     def area(self) -> float:
         """Pixels whose errors go together, A; at least one."""
         return max(1.0, self.weight.size / self.independent)
@@ -168,8 +173,7 @@ class Likelihood:
 
     def variance(self, square: Any) -> Any:
         """Return the most likely squared standard error of paint, given the mean square of its residuals."""
-        most = max(self.least_noise, self.paint_noise or np.inf)
-        return np.clip(square, self.least_noise**2, most**2)
+        return np.clip(square, self.least_noise**2, self.largest_noise**2)
 
     def at_best(self, residual: np.ndarray) -> float:
         """Return the formula above at the most likely noise."""

@@ -3,12 +3,13 @@
 An explanation is a local maximum of the posterior: the lights where they are, one of them elsewhere, softer
 or out, one more. No small step leads from one to the other. Each is begun with the sky's gain as in the
 original and the light where it promises most, descended to by a few Gauss-Newton steps, and judged by one
-number, -2 log evidence in Laplace's approximation (MacKay 1992),
+number beside what lights cost. Of a rendering it is -2 log evidence in Laplace's approximation (MacKay 1992),
 
     F(x) + 6 n log(sigma) + log det H - log det K,
 
-with sigma the most likely noise, n of ``likelihood.py``, H = K + the misfit's Hessian / 2. What an unknown
-gains in misfit it pays for by how far it is determined beyond its prior. The likeliest is kept, and the
+with sigma the most likely noise, n of ``likelihood.py``, H = K + the misfit's Hessian / 2: what an unknown
+gains in misfit it pays for by how far it is determined beyond its prior. Paint is no measurement that could
+determine unknowns: it is F(x) alone, at the largest noise that paint has. The likeliest is kept, and the
 search goes on from there.
 
 Under a rendered target all of the sky may have changed: where a light promises most is asked beside what the
@@ -142,10 +143,9 @@ def _others(best, compared):
 def _unfollowed(problem, best):
     """Whether paint is followed so little that its noise is the largest there may be."""
     likelihood = problem.likelihood
-    most = likelihood.paint_noise
-    if most is None or most <= likelihood.least_noise:
+    if likelihood.robust or likelihood.largest_noise <= likelihood.least_noise:
         return False
-    return likelihood.noise(best.point.residual) >= most
+    return likelihood.noise(best.point.residual) >= likelihood.largest_noise
 
 
 def _neighbours(problem, best, moves, after_step, steps, sky):
@@ -178,20 +178,27 @@ def _cost_of_light(problem: Problem) -> float:
 
 
 def score(problem: Problem, run: gauss_newton.Run, point: Point) -> float:
-    """Return -2 log evidence at a point, but for a constant; inf where it is not finite."""
+    """Return what explanations are compared by, lower where likelier; inf where it is not finite."""
     if point.residual is None:
         return np.inf
-    # ---- log det H - log det K
-    normal = problem.curvature(point, run.start)
-    _, posterior = np.linalg.slogdet(normal.hessian)
-    _, prior = np.linalg.slogdet(normal.precision)
     # ---- What lights cost
     cost = _cost_of_light(problem) * len(problem.added(run.state))
     cost += (_cost_of_choice(problem) + _cost_of_place(problem)) * len(_replaced(problem, run))
+    # ---- How likely all else is
     if problem.likelihood.robust:
         cost += FADED_LIGHT_COST * len(_faded(problem, run.state))
-    evidence = float(problem.unlikeliness(point, run.start) + posterior - prior + cost)
-    return evidence if np.isfinite(evidence) else np.inf
+        cost += problem.unlikeliness(point, run.start) + _determined(problem, run, point)
+    else:
+        cost += problem.loss(point, run.start, problem.likelihood.largest_noise)
+    return float(cost) if np.isfinite(cost) else np.inf
+
+
+def _determined(problem, run, point):
+    """Return log det H - log det K: how far unknowns are determined beyond their prior."""
+    normal = problem.curvature(point, run.start)
+    _, posterior = np.linalg.slogdet(normal.hessian)
+    _, prior = np.linalg.slogdet(normal.precision)
+    return posterior - prior
 
 
 def _replaced(problem, run):

@@ -381,7 +381,8 @@ def _rendered(settings, scene, envmap, other):
         true, info = images.load_envmap(file, envmap.shape[1], settings.input.repair, name="target_map")
         require_radiance(true, str(chosen.file), brightest=BRIGHTEST)
         true = inputs.scaled(true, scene.own.scale, str(chosen.file))
-        source, warnings = f"rendered under {chosen.file}", tuple(info["warnings"])
+        source = f"rendered under {chosen.file}"
+        warnings = tuple(f"{info['path']}: {line}" for line in info["warnings"])
     else:
         true, warnings = latlong.rotate(envmap, chosen.degrees), ()
         source = f"rendered under the map turned by {chosen.degrees:g} degrees"

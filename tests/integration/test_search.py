@@ -223,7 +223,7 @@ def test_paint_that_one_factor_makes_leaves_lights(transport):
 
 
 def test_paint_that_grades_all_of_the_picture_leaves_lights_and_changes_their_colour(transport):
-    """Bluer and darker: where lights are is asked about as of a rendering, and the sun is part of the map."""
+    """Bluer and darker: nothing says that the sun is elsewhere, and it is part of the map."""
     image = sky(SUN)
     before = rendered(transport, image)
     grade = np.float32([0.3, 0.55, 1.0])

@@ -58,7 +58,8 @@ def test_another_map_is_read_at_the_working_width(ball, tmp_path, rng):
     np.testing.assert_array_equal(made.envmap, expected)
     np.testing.assert_array_equal(made.picture, ball.render(expected, spp=4, seed=Seeds(1).target))
     assert str(file) in made.source
-    assert made.warnings == tuple(info["warnings"]) and "negative" in made.warnings[0]
+    assert made.warnings == tuple(f"{file}: {line}" for line in info["warnings"])
+    assert "negative" in made.warnings[0]
 
 
 def test_a_map_that_is_not_finite_is_refused_or_repaired(ball, tmp_path, rng):

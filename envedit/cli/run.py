@@ -52,8 +52,10 @@ def load(name: str, preset: str | None, overrides: Iterable[str]) -> tuple[confi
 
     if run_options.is_scene(name):
         file = Path(name)
-        results = f"{scene_name(file)}_out"
-        by_default = [f"scene.file={config.quote(name)}", f"output.dir={config.quote(results)}"]
+        by_default = [
+            f"scene.file={config.quote(name)}",
+            f"output.dir={config.quote(f'{scene_name(file)}_out')}",
+        ]
         overrides = [*by_default, *overrides]
         return config.loads("", Path.cwd(), "command line", preset, overrides), None, Path.cwd()
     by_name = None if os.path.isfile(name) else shipped.configuration(name)

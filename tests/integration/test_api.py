@@ -308,3 +308,13 @@ def test_an_object_is_put_into_a_photograph_under_its_light(tmp_path, monkeypatc
     assert 0.01 < (outline == 1).mean() < 0.1
     assert ratio[outline == 0].min() < 0.7
     assert abs(np.median(ratio[outline == 0]) - 1) < 0.05
+
+
+def test_a_map_that_is_odd_is_loaded_with_a_warning(tmp_path):
+    file = tmp_path / "odd.exr"
+    texels = np.ones((4, 8, 3), np.float32)
+    texels[1, 2] = -1
+    images.write_exr(file, texels)
+    with pytest.warns(UserWarning, match=r"odd\.exr: 1 texel is negative .* set to 0"):
+        envmap = envedit.load_map(file)
+    np.testing.assert_array_equal(envmap, np.maximum(texels, 0))

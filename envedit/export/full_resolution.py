@@ -178,13 +178,13 @@ class _LayersAt:
             same &= (strength == 1) | (own_core == 0)
         sky = dr.select(same, image, sky)
 
-        # ---- Lights that have moved or were added
+        # ---- Lights that have moved or were added: none shines from rows that follow
+        shines = ~self.cores.follow(band)
         for lobe in self.moved.lobes_at(directions):
-            sky += lobe
-        edited = band.image(sky)
+            sky += dr.select(shines, lobe, 0)
         for radiance in self.moved.radiance(band):
-            edited += radiance
-        return edited.numpy()
+            sky += dr.select(shines, dr.unravel(mi.Color3f, radiance.array), 0)
+        return band.image(sky).numpy()
 
     def _fields_at(self, band, directions):
         """Interpolate what the edit does at the texels of a band."""

@@ -97,9 +97,8 @@ class Derivatives:
                     turns.append(rotation_vector(layers.lights.centres[i], end))
             placements = [(one, flux, size) for one in turns]
             placements.append((turn, flux, size + SIZE_STEP))
-            core, *ends, larger = layers.lights.cores_of(i, placements, layers.whole)
+            core, *ends, larger = layers.cores_of(i, placements)
             cores = np.stack([core, *self._differences(ends), (larger - core) / SIZE_STEP])
-            cores *= layers.changeable
             pictures = self.transport.pictures(cores, self.rows, most).reshape(4, -1, 3)
             lights.append((i, turns, cores, pictures))
             names += [*(("turn", i, axis) for axis in axes), ("size", i, 0)]

@@ -124,7 +124,7 @@ class _TriedLight:
         layers = self.problem.layers
         turn = rotation_vector(layers.lights.centres[self.k], direction)
         placement = turn, np.zeros(3), layers.lights.log_size(degrees)
-        core = layers.lights.cores_of(self.k, [placement], layers.whole) * layers.changeable
+        core = layers.cores_of(self.k, [placement])
         picture = self.problem.transport.pictures(core, self.problem.rows, most=0)
         if self.ground is not None:
             light = layers.ground_light.irradiance(core[0, : layers.shape[0]])

@@ -450,3 +450,27 @@ def test_rows_that_follow_are_carried_and_join_at_the_horizon(kind, finer, satur
     middle = height // 2 - 1
     beside = np.r_[steps[middle - 4 : middle], steps[middle + 1 : middle + 5]]
     assert steps[middle] < 3 * max(beside.max(), 1e-3)
+
+
+@pytest.mark.parametrize("added", [False, True])
+def test_a_light_that_sets_is_cut_off_by_the_horizon(added):
+    height, width = 2 * WORKING[0], 2 * WORKING[1]
+    source = np.minimum(sky(height, width, sun=None), 1)
+    source[: height // 2] = sky(height, width, sun=(40.0, 200.0), radius=4.0, glow=False)[: height // 2]
+    working = latlong.resize(source, *WORKING)
+    made = Layers.of(working, horizon="keep", aureoles=False)
+    light = 1 if added else 0
+    start = {name: value.numpy().copy() for name, value in made.start().items()}
+    start["flux"][:2] = DARK
+    start["flux"][light] = 0.0
+    start["size"][light] = np.log(4 / LOBE_DEGREES) / layers.SCALES["size"] if added else 0.0
+    shown = []
+    for elevation in (30.0, 0.0):
+        params = {name: mi.TensorXf(v) for name, v in sent(made, start, toward(elevation, 90.0), light).items()}
+        _, core = made.parts(params)
+        edited = made.decode(params).numpy()
+        full = full_resolution.carry(made, params, working, edited, source, Rows.of(WORKING[0]))
+        assert not core.numpy()[WORKING[0] // 2 :].any()
+        assert full[height // 2 :].max() < 5
+        shown.append([flux(core.numpy()), flux(np.where(full > 100, full, 0))])
+    np.testing.assert_allclose(np.divide(shown[1], shown[0]), 0.5, atol=0.1)  # at both sizes

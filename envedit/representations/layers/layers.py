@@ -219,17 +219,24 @@ class Layers:
         return mi.TensorXf(sky, (*self.whole, 3)), core
 
     def _core(self, real):
-        core = self.lights.core(real["turn"], real["flux"], real["size"], self.whole)
+        core = self._unkept_core(real)
         if self.kept is not None:
             share, own_core = self._kept_core
             core = share * own_core + (1 - share) * core
         return core if self.fixed is None else core + tensor(self.fixed)
 
+    def _unkept_core(self, real):
+        """Render the cores, (rows, W, 3): rows that follow have none, as a light that sets is behind them."""
+        core = self.lights.core(real["turn"], real["flux"], real["size"], self.shape)
+        low = 3 * (self.whole[0] - self.shape[0]) * self.whole[1]
+        if not low:
+            return core
+        return mi.TensorXf(dr.concat((dr.ravel(core), dr.zeros(mi.Float, low))), (*self.whole, 3))
+
     @functools.cached_property
     def _kept_core(self):
         """How far cores are kept, (rows, W, 3), and what they are of unmoved lights."""
-        real = self._real(self.start())
-        core = self.lights.core(real["turn"], real["flux"], real["size"], self.whole)
+        core = self._unkept_core(self._real(self.start()))
         return tensor(np.repeat(self.kept[..., None], 3, axis=2)), tensor(core.numpy())
 
     def _above(self, real, fields=None):
@@ -384,6 +391,13 @@ class Layers:
         factor = self.lights.glow_of(i, tensor(turn), tensor(log_flux), self._texels.directions)
         log_glow = self._image(dr.log(factor)).numpy()
         return log_glow if self.below is None else np.concatenate([log_glow, log_glow[self.below.mirrored]])
+
+    def cores_of(self, i: int, placements: Sequence[tuple[np.ndarray, np.ndarray, float]]) -> np.ndarray:
+        """Return what :meth:`.Lights.cores_of` does of light ``i``, (k, rows, W, 3), without what is kept."""
+        above = self.lights.cores_of(i, placements, self.shape)
+        low = self.whole[0] - self.shape[0]
+        cores = np.pad(above, ((0, 0), (0, low), (0, 0), (0, 0)))
+        return cores if self.kept is None else cores * self.changeable
 
     # ---- rows ----------------------------------------------------------------------------------------------
 

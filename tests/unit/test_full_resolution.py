@@ -466,7 +466,8 @@ def test_a_light_that_sets_is_cut_off_by_the_horizon(added):
     start["size"][light] = np.log(4 / LOBE_DEGREES) / layers.SCALES["size"] if added else 0.0
     shown = []
     for elevation in (30.0, 0.0):
-        params = {name: mi.TensorXf(v) for name, v in sent(made, start, toward(elevation, 90.0), light).items()}
+        placed = sent(made, start, toward(elevation, 90.0), light)
+        params = {name: mi.TensorXf(value) for name, value in placed.items()}
         _, core = made.parts(params)
         edited = made.decode(params).numpy()
         full = full_resolution.carry(made, params, working, edited, source, Rows.of(WORKING[0]))

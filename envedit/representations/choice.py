@@ -59,9 +59,22 @@ def encoded(
     if settings.representation.kind != "layers":
         fitted = make(settings, folder, progress, rows)
         return fitted, fitted.encode(image, settings.seed)
-    cycles = settings.representation.cycles
     # Towards a rendering an added light may be a haze, or stand where the map has a sun with a glow.
     painted = settings.target.kind in ("image", "strokes")
-    cycles = CYCLES if isinstance(cycles, str) else cycles
-    layers = Layers.of(image, rows, cycles, horizon, aureoles=painted, fixed=fixed, kept=kept)
+    layers = layers_of(image, settings, rows, horizon, aureoles=painted, fixed=fixed, kept=kept)
     return layers, layers.start()
+
+
+def layers_of(
+    image: np.ndarray,
+    settings: config.Config,
+    rows: tuple[int, int] | None = None,
+    horizon: Horizon = "free",
+    aureoles: bool = True,
+    fixed: np.ndarray | None = None,
+    kept: np.ndarray | None = None,
+) -> Layers:
+    """Separate an image (rows, W, 3) as :meth:`.Layers.of` does, with the gain of a configuration."""
+    asked = settings.representation.cycles
+    cycles = CYCLES if isinstance(asked, str) else asked
+    return Layers.of(image, rows, cycles, horizon, aureoles=aureoles, fixed=fixed, kept=kept)

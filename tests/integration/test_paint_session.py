@@ -87,6 +87,16 @@ def test_freedom_and_the_rest_are_solved_for_anew_and_kept(painting):
     assert config.loads(project_text, session.project.folder, "painted.toml").target.rest == "keep"
 
 
+def test_the_gain_is_as_fine_as_the_configuration_asks(tmp_path):
+    nodes = []
+    for cycles in (3, 12):
+        file = tmp_path / f"{cycles}.toml"
+        file.write_text(SMALL + f"[representation]\ncycles = {cycles}\n")
+        problem = Session(project.opened(str(file)), Heard()).solution.problem
+        nodes.append(problem.nodes - problem.ground)
+    assert nodes[0] < 0.2 * nodes[1]
+
+
 def test_advice_is_given_where_little_is_reached(painting):
     session, _ = painting
     status = solved(painting, strokes=[DARK], rest="keep", freedom=0.0)

@@ -18,8 +18,8 @@ from envedit.core.arrays import tensor
 from envedit.core.color import tonemap
 from envedit.core.rows import Rows
 from envedit.losses import metrics
+from envedit.representations.choice import layers_of
 from envedit.representations.layers import below_horizon
-from envedit.representations.layers.layers import Layers
 from envedit.representations.layers.oriented import oriented, oriented_share
 from envedit.representations.layers.placed_lights import PlacedLights
 from envedit.representations.layers.unseen import unseen_kept
@@ -95,8 +95,9 @@ class Solution:
         self.origin = oriented(changed.envmap, document.orientation)
         locked = None if changed.locked is None else oriented(changed.locked, document.orientation)
         self.kept = None if changed.kept is None else oriented_share(changed.kept, document.orientation)
-        layers = Layers.of(
+        layers = layers_of(
             self.origin[self.rows.slice],
+            self.settings,
             self.rows.place,
             horizon=below_horizon.treatment(given.horizon, given.rows, self.origin),
             fixed=None if locked is None else locked[self.rows.slice],

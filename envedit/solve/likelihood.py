@@ -23,7 +23,6 @@ logarithm of the likelihood is, but for a constant,
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -158,7 +157,7 @@ class Likelihood:
         if ratio <= 1:
             return least
         if not self.robust:
-            return float(np.sqrt(self.variance(ratio * least**2)))
+            return float(min(np.sqrt(ratio) * least, self.largest_noise))
         # With the n smallest r within sigma, a their sum of w r^2, and b, c those of w r and w of the others,
         # (a + 2 b sigma - c sigma^2) / (d sigma^2) is to be 1: of the n whose root lies in its range.
         size = sizes(residual)
@@ -170,10 +169,6 @@ class Likelihood:
         sigma = (b + np.sqrt(b * b + (d + c) * a)) / (d + c)
         inside = np.flatnonzero((sigma >= np.append(0, r)) & (sigma <= np.append(r, np.inf)))
         return float(max(least, sigma[inside[0]] if len(inside) else r[-1]))
-
-    def variance(self, square: Any) -> Any:
-        """Return the most likely squared standard error of paint, given the mean square of its residuals."""
-        return np.clip(square, self.least_noise**2, self.largest_noise**2)
 
     def at_best(self, residual: np.ndarray) -> float:
         """Return the formula above at the most likely noise."""

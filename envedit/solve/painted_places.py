@@ -1,6 +1,7 @@
 """Where a light raises the likelihood of paint most, all else as it is.
 
-Nothing but the light is to explain the paint: its pictures are compared as they are, display curve and all.
+Nothing but the light is to explain the paint: its pictures are compared as they are, display curve and all,
+at the largest noise that paint has.
 """
 
 from __future__ import annotations
@@ -163,10 +164,8 @@ class _Comparison:
             strengths = light / np.maximum(mean, 1e-30)
         factors = np.float32(np.outer(OWN_FLUX_FACTORS if own else ADDED_FLUX_SHARES, strengths))
         squares, means = self._sums(pictures, factors)
-        count = 3 * self.likelihood.independent
-        squares = squares / self.likelihood.area
-        variance = self.likelihood.variance(squares / count)
-        unlikeliness = squares / variance + count * np.log(variance) + of_mean(means)
+        area, noise = self.likelihood.area, self.likelihood.largest_noise
+        unlikeliness = squares / (area * noise**2) + of_mean(means)
         least = unlikeliness.argmin(axis=0)[None]
         factor = np.take_along_axis(factors, least, axis=0)[0]
         return factor.astype(np.float64), unlikeliness.min(axis=0)

@@ -338,5 +338,5 @@ def _put(lights, state, k, there):
 
 
 def _unlikeliness(problem, state):
-    point = problem.evaluate(state)
-    return np.inf if point.residual is None else problem.likelihood.at_best(point.residual)
+    point, likelihood = problem.evaluate(state), problem.likelihood
+    return np.inf if point.residual is None else likelihood.misfit(point.residual, likelihood.largest_noise)

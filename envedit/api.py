@@ -119,7 +119,8 @@ def edit(
             mask=arrays.get("mask"),
         )
         result = run(_of_arrays(chosen, arrays), base=base, watch=watch, memory=memory)
-    result.warnings[:0] = filter(None, of_codes)
+    if any(of_codes):
+        result.warnings[:0] = filter(None, of_codes)
     return result
 
 

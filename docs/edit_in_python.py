@@ -13,7 +13,7 @@ sky = envedit.sunsky(64, azimuth=240, elevation=45)
 
 # %% The light transport T: a rendering is T E. Traced once; the sun's texels are made exact for this sky.
 transport = envedit.LightTransport.build(scene, height=32, width=64, spp=64)
-transport.resolve(sky)
+transport = transport.resolved(sky)
 initial = transport.apply(sky).numpy()
 print(f"rendering {initial.shape}; {(transport.influence > 0).mean():.0%} of the texels light something")
 

@@ -240,8 +240,8 @@ class _Edit:
         self.notes.append(self.target.source)
         transport = preparation.renderer.transport
         if transport and target.coverage is not None:
-            transport.resolve(self.original)
-            target = target.seen_as(transport.apply(mi.TensorXf(self.original)).numpy(), target.initial)
+            rendering = transport.resolved(self.original).apply(mi.TensorXf(self.original)).numpy()
+            target = target.seen_as(rendering, target.initial)
         self.start = preparation.edit(target)
         self.job = self.start.job
         self.degrees = self.start.degrees
@@ -273,6 +273,7 @@ class _Edit:
         with self.clock("edit_s"):
             self.watch.stage("editing")
             self.params, self.state = self.start.optimise(resume)
+            self.transport = self.job.renderer.transport
             self.edited = self.solved_map = self.job.decode(self.params)
         photo = self.target.photo
         if self.small is self.scene:

@@ -359,7 +359,7 @@ class Preparation:
                 self._count,
             )
             if traced:
-                self.renderer = self._recordings.transport
+                self.renderer.transport = self._recordings.transport
         return self._recordings
 
     def _count(self, done, total):

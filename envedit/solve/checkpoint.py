@@ -1,7 +1,7 @@
 """A run's state on disk, so that a killed run resumes to the same result.
 
-One ``checkpoint.npz``: the optimiser's parameters and moments, the loop's counters and history, the exact
-columns that the light transport had traced, the target's picture, and a digest of what the run was asked to
+One ``checkpoint.npz``: the optimiser's parameters and moments, the loop's counters and history, which
+columns of the light transport are exact, the target's picture, and a digest of what the run was asked to
 do. It is written to a temporary name and renamed: a file that is there is whole.
 """
 
@@ -24,7 +24,7 @@ from envedit.solve import gauss_newton
 from envedit.solve.adam_loop import State
 
 NAME = "checkpoint.npz"
-_FORMAT = 8  # raise when what is stored, or what the loop makes of it, changes
+_FORMAT = 9  # raise when what is stored, or what the loop makes of it, changes
 
 
 def digest(settings: config.Config, scene: str, inputs: list[np.ndarray]) -> str:

@@ -17,7 +17,7 @@ from envedit.representations.layers.aureoles import log_strength_slope
 from envedit.representations.layers.lights import flux_factor
 from envedit.solve.block_jacobian import BlockJacobian
 from envedit.solve.unknowns import Point, Unknowns
-from envedit.transport.light_transport import COLUMNS_A_LOOK, LightTransport
+from envedit.transport.light_transport import COLUMNS_A_LOOK
 
 NARROW_ANGLE, WIDE_ANGLE = np.radians(0.7), np.radians(2.1)
 """Rotations of the finite difference by a light's direction: half a texel of a map of 256, and, where that
@@ -41,14 +41,14 @@ class Linearisation:
 class Derivatives:
     """Derivatives of the renderings of some unknowns; those of the last point are kept.
 
-    ``transport`` gets columns, with the fewest paths, for texels that a light covers; ``blocks`` is T of
-    blocks of pixels. ``angle`` is the rotation of the finite difference by a light's direction, radians.
+    ``blocks`` is T of blocks of pixels; ``angle`` is the rotation of the finite difference by a light's
+    direction, radians.
     """
 
-    def __init__(self, unknowns: Unknowns, transport: LightTransport, blocks: BlockJacobian):
-        self.unknowns, self.transport, self.blocks = unknowns, transport, blocks
+    def __init__(self, unknowns: Unknowns, blocks: BlockJacobian):
+        self.unknowns, self.blocks = unknowns, blocks
         self.layers = unknowns.layers
-        self.rows, self.shape = self.layers.active, transport.shape
+        self.rows = self.layers.active
         self.angle = NARROW_ANGLE
         self._last: tuple[np.ndarray, float, Linearisation] | None = None
 
@@ -73,7 +73,7 @@ class Derivatives:
         What a node changes is taken to spread so over a block: by texture, shading and outlines. ``cores``
         are pictures, (pixels, 3) each, of what in the point's rendering is light of cores.
         """
-        sky = point.rendering - self.transport.other_light()
+        sky = point.rendering - point.transport.other_light()
         for one in cores:
             sky -= one.reshape(sky.shape)
         return self.blocks.profile(np.maximum(sky, 0))
@@ -86,7 +86,7 @@ class Derivatives:
         names: list = []
         # Columns of one light must not take the place of another's.
         lights_shining = self.unknowns.shining(state)
-        most = min(COLUMNS_A_LOOK, self.transport.capacity // (4 * max(len(lights_shining), 1)))
+        most = min(COLUMNS_A_LOOK, point.transport.capacity // (4 * max(len(lights_shining), 1)))
         for i in lights_shining:
             turn, flux, size = state["turn"][i], state["flux"][i], float(state["size"][i, 0])
             axes = self._tangents(state, i)
@@ -99,7 +99,7 @@ class Derivatives:
             placements.append((turn, flux, size + SIZE_STEP))
             core, *ends, larger = layers.cores_of(i, placements)
             cores = np.stack([core, *self._differences(ends), (larger - core) / SIZE_STEP])
-            pictures = self.transport.pictures(cores, self.rows, most).reshape(4, -1, 3)
+            pictures = point.transport.pictures(cores, self.rows, most).reshape(4, -1, 3)
             lights.append((i, turns, cores, pictures))
             names += [*(("turn", i, axis) for axis in axes), ("size", i, 0)]
             names += [("flux", i, c) for c in range(3)]
@@ -128,7 +128,8 @@ class Derivatives:
         if self.unknowns.saturates:
             names.append(("saturation", 0, 0))
             of_sky.append(self._by_saturation(point, profile))
-        return self._apart([pictures for *_, pictures in lights], of_sky), names, profile
+        pictures = self._apart([pictures for *_, pictures in lights], of_sky, point.transport.shape)
+        return pictures, names, profile
 
     def _by_saturation(self, point, profile):
         """Return the derivative of the rendering by the log saturation, (h * w, 3), through the blocks."""
@@ -157,21 +158,21 @@ class Derivatives:
         turns[i] = turn
         return self.layers.log_glow_of(i, turns, state["flux"])
 
-    def _apart(self, of_lights, of_sky):
+    def _apart(self, of_lights, of_sky, shape):
         """Take pictures by flux, two angles and size, (4, pixels, 3), of every light apart: (k, h, w, 3).
 
         By direction, size, and flux per channel; in memory channel by channel. Pictures (h * w, 3) of
         unknowns that are no light's come last.
         """
         first = 6 * len(of_lights)
-        columns = np.zeros((3, first + len(of_sky), math.prod(self.shape)), np.float32)
+        columns = np.zeros((3, first + len(of_sky), math.prod(shape)), np.float32)
         for k, pictures in enumerate(of_lights):
             for c in range(3):
                 columns[c, 6 * k : 6 * k + 3] = pictures[1:, :, c]
                 columns[c, 6 * k + 3 + c] = pictures[0, :, c]
         for k, picture in enumerate(of_sky, first):
             columns[:, k] = picture.reshape(-1, 3).T
-        return columns.reshape(3, -1, *self.shape).transpose(1, 2, 3, 0)
+        return columns.reshape(3, -1, *shape).transpose(1, 2, 3, 0)
 
     def _tangents(self, state, i):
         """Two directions in which a light can move, (3,) each: axes of rotation."""

@@ -111,9 +111,10 @@ class EditState:
     def problem(self, transport: LightTransport | None = None) -> Problem:
         """Return what is minimised through T, by default the renderer's."""
         traced = transport or self.renderer.transport
-        if traced not in self._blocks:
+        recording = traced.forward
+        if recording not in self._blocks:
             shape = self.original.shape[:2]
-            self._blocks = {traced: block_jacobian.BlockJacobian(self.representation, traced, shape)}
+            self._blocks = {recording: block_jacobian.BlockJacobian(self.representation, traced, shape)}
         target = self.target
         expected = prior.Prior()
         if not self.rendered:
@@ -126,7 +127,7 @@ class EditState:
             Likelihood.of_target(target),
             expected,
             saturates=self.rendered,
-            blocks=self._blocks[traced],
+            blocks=self._blocks[recording],
             photo=None if target.photo is None else Photographed.of(target.photo),
             clipped=target.clipped,
         )

@@ -104,7 +104,7 @@ def reachable(
     Parameters
     ----------
     transport : LightTransport
-        T; gets exact columns for the bright texels of the original.
+        T.
     original : ndarray (H, W, 3)
         The map, linear radiance.
     target : ndarray (h, w, 3)
@@ -139,7 +139,7 @@ def reachable(
         active &= kept < map_regions.KEPT_SHARE
     likelihood = likelihood or Likelihood(on_average_one(None, transport.shape))
     painted = likelihood.weight[..., 0] > 0 if painted is None else painted
-    transport.resolve(original)
+    transport = transport.resolved(original)
     initial = _rendering(transport, original)
     aim = target.astype(np.float64)
     if rendered is not None:
@@ -154,7 +154,7 @@ def reachable(
     if distance > 0 and (transport.influence[active] > 0).any():
         candidates.append(_solution(transport, original, active, request))
     if distance > 0 and known is not None:
-        transport.resolve(known)
+        transport = transport.resolved(known)
         candidates.append((known, _rendering(transport, known)))
     envmap, picture = min(candidates, key=lambda one: request.distance(one[1]))
 

@@ -10,12 +10,14 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from envedit.core.errors import NumericalError
 from envedit.solve.derivatives import NARROW_ANGLE, WIDE_ANGLE
 from envedit.solve.map_problem import Point, Posterior, Problem
+from envedit.transport.exact_columns import Columns
 
 MOST_STEPS, LEAST_DECREASE = 16, 2e-3
 """Most steps, and the relative decrease of F below which no further step is made."""
@@ -46,17 +48,26 @@ class Run:
     # ``residual`` RMS of display values, ``damping``, ``step_ms``
     history: list[dict] = field(default_factory=list)
     most: int = MOST_STEPS  # steps after which it ends
+    columns: Columns | None = None  # of T, with which the state was rendered last
     hold: float = 1.0  # weight of what was not painted, where it is raised (:mod:`.hold`)
     # Derivatives by a light's direction are wide differences: with narrow ones no step leads further
     wide: bool = False
     corrected: bool = False  # the last steps, towards a target without T's error (:mod:`.layers_solver`)
+
+    def onward(self, **changes: Any) -> Run:
+        """Return another run, with the defaults but for changes, that goes on from where this one is."""
+        return Run(self.state, self.start, history=self.history, columns=self.columns, **changes)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return all but the history as arrays, for a checkpoint."""
         both = {f"{part}.{k}": v for part in ("state", "start") for k, v in getattr(self, part).items()}
         scale = self.scale if np.isfinite(self.scale) else 0.0  # before the first step
         numbers = self.damping, scale, self.finished, self.most, self.hold
-        return both | {"numbers": np.array([*numbers, self.wide, self.corrected])}
+        columns = self.columns or Columns.none()
+        return both | {
+            "numbers": np.array([*numbers, self.wide, self.corrected]),
+            "columns": np.stack([columns.texels, columns.paths]),
+        }
 
     @classmethod
     def of_arrays(cls, arrays: dict[str, np.ndarray], history: list[dict]) -> Run:
@@ -66,6 +77,7 @@ class Run:
             for part in ("state", "start")
         )
         damping, scale, finished, most, hold, wide, corrected = arrays["numbers"].tolist()
+        columns = arrays.get("columns")
         return cls(
             state=state,
             start=start,
@@ -74,6 +86,7 @@ class Run:
             finished=bool(finished),
             history=list(history),
             most=int(most),
+            columns=None if columns is None else Columns(*columns),
             hold=hold,
             wide=bool(wide),
             corrected=bool(corrected),
@@ -127,9 +140,9 @@ def solve(
     """
     start, known = problem.state(params), run is not None
     if run is None:
-        run, point = Run(start, start), problem.evaluate(start)
-    else:  # it has the columns with which its last point was rendered
-        point = problem.evaluate(run.state, resolve=False)
+        run = Run(start, start)
+    point = reached(problem, run)
+    run.columns = point.transport.exact
     if point.residual is None:
         raise NumericalError("the initial map is not finite: check the input map for extreme values")
     if after_step and (known or not iterations):
@@ -138,7 +151,7 @@ def solve(
     point = descended(problem, run, point, left, after_step)
     normal = problem.curvature(point, run.start)
     note, state = "", run.state
-    first = problem.evaluate(start, resolve=False) if sparing and run.history else None
+    first = problem.evaluate(start, point.transport, resolve=False) if sparing and run.history else None
     if first is not None and first.residual is not None:
         loss = problem.unlikeliness(point, run.start) + 2 * normal.determined
         noise = problem.likelihood.noise(point.residual)
@@ -151,6 +164,13 @@ def solve(
         if note:
             state, normal = start, problem.curvature(first, start)
     return Solution(problem.solution_params(state), run, problem.posterior(state, normal), note)
+
+
+def reached(problem: Problem, run: Run) -> Point:
+    """Return the point where a run is, rendered as it was last."""
+    if run.columns is None:
+        return problem.evaluate(run.state)
+    return problem.evaluate(run.state, problem.transport.with_columns(run.columns), resolve=False)
 
 
 def descended(
@@ -206,6 +226,7 @@ def descended(
                     "step_ms": round(1000 * (time.perf_counter() - began), 3),
                 }
             )
+        run.columns = point.transport.exact
         if after_step and (better is not None or run.finished):
             after_step(run, point)
     return point
@@ -228,17 +249,17 @@ def _lower(problem, run, point, normal):
     """Try steps of more and more damping until one lowers F.
 
     Returns the point that the run is at, F there, and the trial that is lower, or None. The point may have
-    been rendered anew: columns of T that were traced for a trial are not in what it is compared with.
+    been rendered anew, with the columns of T that a trial has more.
     """
     before = problem.loss(point, run.start, run.scale)
     for _ in range(DAMPINGS_TRIED):
         state = problem.step(run.state, normal, run.damping)
-        there = None if state is None else problem.evaluate(state)
+        there = None if state is None else problem.evaluate(state, point.transport)
         if there is not None and there.residual is not None:
             misfit = problem.likelihood.misfit(there.residual, run.scale)
             trial = _Trial(there, misfit, problem.penalty(there.state, run.start))
             if trial.loss >= before:
-                again = problem.evaluate(run.state, resolve=False)
+                again = problem.evaluate(run.state, there.transport, resolve=False)
                 if again.residual is not None:
                     point, before = again, problem.loss(again, run.start, run.scale)
             if trial.loss < before:

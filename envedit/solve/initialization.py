@@ -77,7 +77,6 @@ def recordings(
         spp=few,
         max_depth=transport.bounces + 1,
         memory_gb=sampling_plan.gigabytes(pixels, few, min(SECOND_COLUMNS, transport.capacity) + 1),
-        refresh=0,
     )
     octaves = gain_bandwidth.octaves(
         transport,
@@ -108,12 +107,11 @@ def trusted(envmap: np.ndarray, recordings: Recordings, target: Target) -> tuple
     """Weigh a rendered target's pixels by what is known of them under a map; returns the target and notes.
 
     ``envmap`` (H, W, 3) is the map as far as it is solved: images of lights, and caustics, are where the
-    lights now are. ``recordings`` has a second one; the bright columns of both may change.
+    lights now are. ``recordings`` has a second one.
     """
     pictures = []
     for one in (recordings.transport, recordings.second):
-        one.resolve(envmap)
-        pictures.append(one.apply(mi.TensorXf(envmap)).numpy())
+        pictures.append(one.resolved(envmap).apply(mi.TensorXf(envmap)).numpy())
     share = recordings.second.spp / recordings.transport.spp
     first, second = pictures
     views = recordings.transport.scene.rows

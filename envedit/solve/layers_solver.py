@@ -95,17 +95,15 @@ class LayersSolver:
             If they cannot begin.
         """
         problem = self.edit.problem(transport)
-        problem.evaluate(begun.state)  # another explanation may have taken its columns of T
         return self._steps(problem, begun, sparing=self.edit.rendered).params
 
     def settle(self) -> float:
         """Go on from :attr:`begun` until no step and no light leads further; returns -2 log evidence."""
         most, problem = self.edit.settings.optimizer.iterations, self.edit.problem()
-        problem.evaluate(self.begun.state)  # another edit may have taken its columns of T
         while self.begun is not None:
             solution = gauss_newton.solve(problem, self.params, most, run=self.begun, sparing=False)
             self.begun = self._another(solution)
-        point = problem.evaluate(solution.run.state)  # what was tried since may have taken its columns
+        point = gauss_newton.reached(problem, solution.run)
         self.begun = solution.run
         if point.residual is not None:  # what T errs by may have been fitted
             shown = self._path_traced(point.edited)
@@ -133,14 +131,12 @@ class LayersSolver:
         settings = edit.settings.optimizer
         digest = checkpoint.digest(edit.settings, edit.scene.digest, [edit.original, *edit.target.asked])
         if edit.folder and resume and (stored := checkpoint.load(edit.folder, digest)):
-            state, arrays, traced, picture = stored
-            edit.renderer.restore(traced)
+            state, arrays, _, picture = stored
             if edit.target.photo is not None:
                 edit.target = edit.target.developed(edit.target.photo.of_array(arrays.pop("photo")))
             edit.target = replace(edit.target, picture=picture, compared=arrays.pop("aim"))
             run = gauss_newton.Run.of_arrays(arrays, state.history)
-        elif run is not None:
-            edit.problem().evaluate(run.state)  # another explanation may have taken its columns
+            edit.renderer.transport.restored(run.columns)
         self._hold(run)
 
         # ---- Runs, one from where the last has ended
@@ -155,6 +151,7 @@ class LayersSolver:
                     break
                 run = following
         self.posterior = solution.posterior
+        edit.renderer.transport = edit.problem().transport.with_columns(solution.run.columns)
         self.note = "; ".join(self._notes(solution))
         history = solution.run.history
         return solution.params, adam_loop.State(step=len(history), history=history)
@@ -215,10 +212,10 @@ class LayersSolver:
         edit, run = self.edit, solution.run
         if not self._goes_on(solution):
             return None
-        point = edit.problem().evaluate(run.state)
+        point = gauss_newton.reached(edit.problem(), run)
         edit.target = edit.target.seen_as(point.rendering, self._path_traced(point.edited))
         most = len(run.history) + CORRECTED_STEPS
-        return gauss_newton.Run(run.state, run.start, history=run.history, most=most, corrected=True)
+        return run.onward(most=most, corrected=True)
 
     def _take_off_camera(self, solution):
         """Divide the target by what the solution has of the camera's factor, which is then 1."""
@@ -238,7 +235,7 @@ class LayersSolver:
             return None
 
         # ---- Where it lies
-        rendering = edit.problem().evaluate(run.state, resolve=False).rendering
+        rendering = gauss_newton.reached(edit.problem(), run).rendering
         aligned = photo.aligned(rendering)
         if np.abs(aligned.placed.shares).max() <= 1:
             photo = aligned
@@ -249,8 +246,8 @@ class LayersSolver:
         for curve in photo.curves:
             edit.target = before.developed(before.photo.under(curve, rendering, before.weight))
             problem = edit.problem()
-            one = gauss_newton.Run(run.state, run.start, history=list(run.history))
-            point = problem.evaluate(one.state)
+            one = replace(run.onward(), history=list(run.history))
+            point = gauss_newton.reached(problem, one)
             if point.residual is None:
                 continue
             point = gauss_newton.descended(problem, one, point, search.EXPLANATION_STEPS)
@@ -288,12 +285,12 @@ class LayersSolver:
         if more is None:
             return None
         most = len(run.history) + gauss_newton.MOST_STEPS
-        return self._hold(gauss_newton.Run(run.state, run.start, history=run.history, most=most, hold=more))
+        return self._hold(run.onward(most=most, hold=more))
 
     def _changed_rest(self, run):
         """Return how what was not painted has changed at the point of a run, through T."""
         target = self.edit.target
-        rendering = self.edit.problem().evaluate(run.state, resolve=False).rendering
+        rendering = gauss_newton.reached(self.edit.problem(), run).rendering
         return hold.change(rendering, target.aim, target.coverage, target.weight)
 
     # ---- What T has no part in -----------------------------------------------------------------------------
@@ -333,8 +330,7 @@ class _Checkpoints:
             arrays = run.arrays() | {"aim": edit.target.aim}
             if edit.target.photo is not None:
                 arrays["photo"] = edit.target.photo.array
-            traced = edit.renderer.state()
-            checkpoint.save(edit.folder, self.digest, state, arrays, traced, edit.target.picture)
+            checkpoint.save(edit.folder, self.digest, state, arrays, {}, edit.target.picture)
             self.saved = time.perf_counter()
         if self.interrupt.is_set():
             raise Interrupted(point.edited, done)

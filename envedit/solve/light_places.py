@@ -21,6 +21,7 @@ from envedit.core.arrays import tensor
 from envedit.representations.layers.lights import FAINTEST
 from envedit.solve.map_problem import Point, Problem
 from envedit.solve.normal_equations import Normal, forward
+from envedit.transport.light_transport import LightTransport
 
 PROBE_SPACINGS = (2, 1)
 """Distances in texels of the exact columns around the best cell, one after the other."""
@@ -54,12 +55,13 @@ def lit_ground(problem: Problem, point: Point) -> np.ndarray | None:
     irradiance = light.irradiance(point.edited[problem.rows][:up])
     ground = np.zeros_like(point.edited)
     ground[problem.rows] = point.sky * layers.lit[:, None, None] / np.maximum(irradiance, 1e-30)
-    picture = problem.transport.linear(tensor(ground)).numpy()
+    picture = point.transport.linear(tensor(ground)).numpy()
     return picture if picture.any() else None
 
 
 def probed(
     problem: Problem,
+    transport: LightTransport,
     row: int,
     column: int,
     flux: np.ndarray,
@@ -79,7 +81,7 @@ def probed(
     texels = (rows[:, None] * width + np.unique((column + steps) % width)).ravel()
     omega = latlong.lookup_solid_angles(height, width)[texels // width]
     unit = (flux / omega[:, None]).astype(np.float32)
-    pictures = problem.transport.probe(texels) * unit[:, None, :]
+    pictures = transport.probe(texels) * unit[:, None, :]
     if ground is not None:
         upward = np.maximum(latlong.directions(height, width)[texels // width, texels % width, 1], 0)
         pictures += np.float32(np.outer(upward, flux)[:, None, :] * ground.reshape(-1, 3))
@@ -152,9 +154,9 @@ class Places:
         picture = None
         for spacing in PROBE_SPACINGS:
             reach = spacing  # texels to each side: as many as they are apart
-            if self.problem.transport.capacity < (2 * reach + 1) ** 2:
-                break  # memory leaves no exact columns to refine
-            texels, pictures = probed(self.problem, row, column, flux, spacing, reach, self._ground)
+            texels, pictures = probed(
+                self.problem, self.point.transport, row, column, flux, spacing, reach, self._ground
+            )
             strengths, falls = self._of_pixels(pictures)
             at = int(np.argmax(falls))
             if not falls[at] > 0:

@@ -93,7 +93,7 @@ class Problem(Unknowns):
     layers : Layers
         After ``encode``.
     transport : LightTransport
-        T; gets exact columns for texels that become bright.
+        T.
     envmap : ndarray (H, W, 3)
         The original.
     picture : ndarray (h, w, 3)
@@ -129,7 +129,7 @@ class Problem(Unknowns):
         self.photo, self.clipped = photo, clipped
         self.transport, self.envmap, self.rows = transport, envmap, layers.active
         self.blocks = blocks or BlockJacobian(layers, transport, envmap.shape[:2])
-        self.derivatives = Derivatives(self, transport, self.blocks)
+        self.derivatives = Derivatives(self, self.blocks)
         self.expect(prior or Prior())
         self._aim(picture, likelihood)
 
@@ -150,21 +150,26 @@ class Problem(Unknowns):
 
     # ---- F -------------------------------------------------------------------------------------------------
 
-    def evaluate(self, state: dict, resolve: bool = True) -> Point:
-        """Compose and render the map of a state; ``resolve``: trace columns for texels that became bright."""
+    def evaluate(self, state: dict, transport: LightTransport | None = None, resolve: bool = True) -> Point:
+        """Compose and render the map of a state through T, by default the problem's.
+
+        ``resolve``: with further exact columns where the map is bright.
+        """
+        transport = transport or self.transport
         sky, core = (part.numpy() for part in self.layers.parts(self.params(state)))
         with np.errstate(over="ignore", invalid="ignore"):
             crop, edited = sky + core, self.envmap.copy()
         edited[self.rows] = crop
         if not np.isfinite(crop).all():
-            return Point(state, edited, sky, None, None)
+            return Point(state, edited, sky, transport, None, None)
         if resolve:
-            self.transport.resolve(edited, limit=COLUMNS_A_LOOK)
-        rendering = self.transport.apply(tensor(edited)).numpy()
+            transport = transport.resolved(edited, limit=COLUMNS_A_LOOK)
+            transport = transport.with_probed(transport.main(core[None], self.rows))
+        rendering = transport.apply(tensor(edited)).numpy()
         residual = self.residual(state, rendering)
         if not np.isfinite(residual).all():
-            return Point(state, edited, sky, None, None)
-        return Point(state, edited, sky, rendering, residual)
+            return Point(state, edited, sky, transport, None, None)
+        return Point(state, edited, sky, transport, rendering, residual)
 
     def residual(self, state: dict, rendering: np.ndarray) -> np.ndarray:
         """Return display values of a rendering (h, w, 3), under a camera's factor, less the target's."""
@@ -301,7 +306,7 @@ class Problem(Unknowns):
 
         By every node's log gain, (n, 3), and by the log saturation; 0 where that is no unknown.
         """
-        light = self.transport.adjoint(np.float32(picture)).numpy()[self.rows]
+        light = point.transport.adjoint(np.float32(picture)).numpy()[self.rows]
         params = self.params(point.state)
         names = self.grids + ["saturation"] * self.saturates
         with dr.isolate_grad():

@@ -27,6 +27,7 @@ from envedit.solve.light_places import (
 )
 from envedit.solve.likelihood import Likelihood, of_mean
 from envedit.solve.map_problem import Problem
+from envedit.transport.light_transport import LightTransport
 
 OWN_FLUX_FACTORS = 2.0 ** np.arange(-2, 1.5, 0.5)
 """Fluxes that a light of the map is tried with elsewhere, over its own."""
@@ -49,15 +50,17 @@ class PaintedPlace:
     degrees: float = LOBE_DEGREES  # radius of a light that is added
 
 
-def best(problem: Problem, state: dict, k: int, away: np.ndarray | None = None) -> list[PaintedPlace]:
-    """List where light ``k``, dark in a state, raises the likelihood most.
+def best(
+    problem: Problem, state: dict, transport: LightTransport, k: int, away: np.ndarray | None = None
+) -> list[PaintedPlace]:
+    """List where light ``k``, dark in a state, raises the likelihood most, through ``transport``.
 
     All cells of the sky are tried through the block transport, with several fluxes each, and texels around
     the best ones through exact columns. Texels are :data:`.light_places.PLACES_APART_COSINE` apart, also from
     ``away``. A light that is added is the smallest there that promises as much as the best one.
     """
     lights, blocks, likelihood = problem.layers.lights, problem.blocks, problem.likelihood
-    point = problem.evaluate(state, resolve=False)
+    point = problem.evaluate(state, transport, resolve=False)
     _, directions = blocks.sky
     if point.residual is None or not len(directions):
         return []
@@ -95,7 +98,7 @@ class _TriedLight:
     """A light in place of none, in the picture of a point."""
 
     def __init__(self, problem, point, k):
-        self.problem, self.k = problem, k
+        self.problem, self.transport, self.k = problem, point.transport, k
         self.own, self.flux = k < problem.layers.lights.own, problem.layers.lights.flux[k]
         self.ground = lit_ground(problem, point)
         self._compared = _Comparison(
@@ -112,7 +115,7 @@ class _TriedLight:
         row, column = (round(float(x)) for x in latlong.texel_position(direction, height, width))
         for spacing in PROBE_SPACINGS:
             texels, pictures = probed(
-                self.problem, row, column, self.flux, spacing, reach=1, ground=self.ground
+                self.problem, self.transport, row, column, self.flux, spacing, reach=1, ground=self.ground
             )
             factors, unlikeliness = self._best(pictures)
             at = int(np.argmin(unlikeliness))
@@ -126,7 +129,7 @@ class _TriedLight:
         turn = rotation_vector(layers.lights.centres[self.k], direction)
         placement = turn, np.zeros(3), layers.lights.log_size(degrees)
         core = layers.cores_of(self.k, [placement])
-        picture = self.problem.transport.pictures(core, self.problem.rows, most=0)
+        picture = self.transport.pictures(core, self.problem.rows, most=0)
         if self.ground is not None:
             light = layers.ground_light.irradiance(core[0, : layers.shape[0]])
             picture += np.float32(light * self.ground)

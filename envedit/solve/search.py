@@ -97,7 +97,7 @@ def search(
     and then; what it raises ends the search.
     """
     steps = min(most, EXPLANATION_STEPS)
-    best = _descended(problem, {}, gauss_newton.Run(start, start), steps)
+    best = _descended(problem, {}, gauss_newton.Run(start, start), problem.transport, steps)
     cleared = {name: np.zeros_like(start[name]) for name in ("gain", "saturation")}
     compared: list[Explanation] = [best]
     better = best if best.point.residual is not None else None
@@ -119,7 +119,7 @@ def further(
 
     ``run`` is where no step leads further; other parameters are those of :func:`search`.
     """
-    point = problem.evaluate(run.state, resolve=False)
+    point = gauss_newton.reached(problem, run)
     best = Explanation({}, run, point, score(problem, run, point))
     promising = [move for move in _moves(problem, best) if move.gain > 0]
     return _likelier(best, _neighbours(problem, best, promising, after_step, EXPLANATION_STEPS, {}))
@@ -155,7 +155,7 @@ def _neighbours(problem, best, moves, after_step, steps, sky):
         history = list(best.run.history) if not sky else []
         run = gauss_newton.Run(move.state | sky, move.centre, history=history)
         done = move.after(best.done, problem.layers.lights.own)
-        neighbours.append(_descended(problem, done, run, steps))
+        neighbours.append(_descended(problem, done, run, best.point.transport, steps))
         if after_step:
             after_step()
     return neighbours
@@ -213,9 +213,9 @@ def _faded(problem, state):
     return [k for k in problem.shining(state) if k < own and state["flux"][k].mean() < FADED_LOG_FLUX]
 
 
-def _descended(problem, done, run, steps):
-    """Return the explanation that a few steps from where a run is lead to."""
-    point = problem.evaluate(run.state)
+def _descended(problem, done, run, transport, steps):
+    """Return the explanation that a few steps from where a run is lead to, first through ``transport``."""
+    point = problem.evaluate(run.state, transport)
     if point.residual is not None:
         point = gauss_newton.descended(problem, run, point, steps)
     return Explanation(done, run, point, score(problem, run, point))
@@ -247,14 +247,13 @@ def _best_kinds(moves):
 def _beside_the_sky(problem, best):
     """Yield moves that lower F together with one step of all else."""
     lights, state, start = problem.layers.lights, best.run.state, best.run.start
-    problem.evaluate(state)  # what was tried since may have taken its columns of T
+    transport = best.point.transport
     for k in problem.shining(state):
         own, dark = k < lights.own, with_light(state, k, flux=DARK)
-        places = _places(problem, dark, start)
+        places = _places(problem, dark, start, transport)
         if places is None:
             continue
-        # With the columns of T that the dark sky was rendered with.
-        stays = places.fall(problem.evaluate(state, resolve=False).rendering)
+        stays = places.fall(best.point.rendering)
         # ---- out
         worth = ADDED_LIGHT_COST if own else _cost_of_light(problem)
         if k in _faded(problem, state):
@@ -272,16 +271,16 @@ def _beside_the_sky(problem, best):
     # ---- one more
     spare = [k for k in range(lights.own, lights.count) if k not in problem.added(state)]
     for k in spare[:1]:
-        places = _places(problem, state, start)
+        places = _places(problem, state, start, transport)
         for there in places.best(k) if places else []:
             turn, flux = rotation_vector(lights.centres[k], there.direction), np.log(there.factor)
             more, centre = (with_light(one, k, turn=turn, flux=flux, size=0.0) for one in (state, start))
             yield _Move(k, ADDED, more, centre, gain=there.fall - ADDED_LIGHT_COST)
 
 
-def _places(problem, state, start):
+def _places(problem, state, start, transport):
     """Return the places of lights that are dark in a state; None where F has no value there."""
-    point = problem.evaluate(state, resolve=False)
+    point = problem.evaluate(state, transport, resolve=False)
     if point.residual is None:
         return None
     try:
@@ -294,10 +293,10 @@ def _places(problem, state, start):
 def _under_the_original(problem, best):
     """Yield moves that raise the likelihood under the gain of the original, all else as it is."""
     state = best.run.state | {name: np.zeros_like(best.run.state[name]) for name in ("gain", "saturation")}
-    start = best.run.start
+    start, transport = best.run.start, best.point.transport
     lights = problem.layers.lights
     spare = [k for k in range(lights.own, lights.count) if k not in problem.added(state)]
-    now = _unlikeliness(problem, state)
+    now = _unlikeliness(problem, state, transport)
 
     for k in problem.shining(state):
         own = k < lights.own
@@ -305,7 +304,7 @@ def _under_the_original(problem, best):
         # ---- elsewhere
         away = problem.direction(state, k)
         cost = _cost_of_choice(problem) if own and not start["turn"][k].any() else 0.0
-        for there in painted_places.best(problem, dark, k, away):
+        for there in painted_places.best(problem, dark, transport, k, away):
             moved = _put(lights, state, k, there)
             centre = with_light(start, k, turn=moved["turn"][k]) if own else _put(lights, start, k, there)
             yield _Move(k, MOVED, moved, centre, gain=now - there.unlikeliness - cost)
@@ -316,15 +315,15 @@ def _under_the_original(problem, best):
             size = lights.log_size(painted_places.LARGER_DEGREES[0])
             soft = with_light(dark, spare[0], turn=turn, flux=flux, size=size)
             centre = with_light(start, spare[0], turn=turn, flux=flux, size=size)
-            yield _Move(k, SOFTENED, soft, centre, gain=now - _unlikeliness(problem, soft))
+            yield _Move(k, SOFTENED, soft, centre, gain=now - _unlikeliness(problem, soft, transport))
         # ---- out, if it was added
         if not own:
-            gain = now - _unlikeliness(problem, dark) + ADDED_LIGHT_COST
+            gain = now - _unlikeliness(problem, dark, transport) + ADDED_LIGHT_COST
             yield _Move(k, REMOVED, dark, start, gain)
 
     # ---- one more, as large as it must be
     for k in spare[:1]:
-        for there in painted_places.best(problem, state, k):
+        for there in painted_places.best(problem, state, transport, k):
             more, centre = (_put(lights, one, k, there) for one in (state, start))
             yield _Move(k, ADDED, more, centre, gain=now - there.unlikeliness - ADDED_LIGHT_COST)
 
@@ -337,6 +336,6 @@ def _put(lights, state, k, there):
     return with_light(state, k, turn=turn, flux=there.log_flux, size=lights.log_size(there.degrees))
 
 
-def _unlikeliness(problem, state):
-    point, likelihood = problem.evaluate(state), problem.likelihood
+def _unlikeliness(problem, state, transport):
+    point, likelihood = problem.evaluate(state, transport), problem.likelihood
     return np.inf if point.residual is None else likelihood.misfit(point.residual, likelihood.largest_noise)

@@ -34,7 +34,7 @@ def find(
     No texel becomes brighter than :data:`.radiance.BRIGHTEST`.
     """
     # ---- What these texels give the rendering, and all else: a sun by exact columns
-    transport.resolve(envmap)
+    transport = transport.resolved(envmap)
     others = np.where(active[..., None], 0, envmap).astype(np.float32)
     still = transport.apply(mi.TensorXf(others)).numpy()
     lit = transport.apply(mi.TensorXf(envmap)).numpy() - still

@@ -16,6 +16,7 @@ from envedit.core.arrays import tensor
 from envedit.core.rotations import rotated, rotation_vector
 from envedit.representations.layers.layers import Layers
 from envedit.representations.layers.lights import DARK
+from envedit.transport.light_transport import LightTransport
 
 OWN_LOG_SIZES, LOBE_LOG_SIZES = (-3.0, 1.5), (-3.0, 2.1)
 """Logarithms of sizes that a light of the map may take on, and an added one: points that are too few for a
@@ -29,12 +30,14 @@ what its colours have of noise."""
 class Point:
     """A state with its map, rendering and residual of display values; the last two None if not finite.
 
-    ``sky`` is the map's active rows without the cores of its lights, (rows, W, 3).
+    ``sky`` is the map's active rows without the cores of its lights, (rows, W, 3); ``transport`` is T with
+    the columns through which the map was rendered.
     """
 
     state: dict
     edited: np.ndarray
     sky: np.ndarray
+    transport: LightTransport
     rendering: np.ndarray | None
     residual: np.ndarray | None
 

@@ -2,14 +2,17 @@
 
 Recorded samples are spread over the whole map, so that a single bright texel is hit by few of them. A column
 holds, for one texel, its contribution to every pixel, from as many rays towards it as there are path
-vertices. Columns lie in a bounded store, packed as (r, g, b, unused) and interleaved in slices of 8 pixels,
-so that both the product and its adjoint read neighbouring memory. Their number is an argument of the
-kernels, not a part of them: more columns compile nothing.
+vertices. Which columns a rendering uses is a value, :class:`Columns`; the columns themselves lie in a bounded
+store, packed as (r, g, b, unused) and interleaved in slices of 8 pixels, so that both the product and its
+adjoint read neighbouring memory. Their number is an argument of the kernels, not a part of them: more columns
+compile nothing.
 """
 
 from __future__ import annotations
 
 import itertools
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -26,36 +29,69 @@ MOST_VALUES = 1 << 22
 _SEGMENTS = 16
 
 
-class ExactColumns:
-    """Columns of T for some texels of a grid, traced on demand.
+@dataclass(frozen=True, eq=False)
+class Columns:
+    """Which texels have an exact column: ``texels`` (n,) int64, distinct, first those that matter most.
 
-    Made for a scene, its camera and film, the texels of ``grid`` and paths of ``bounces`` surface points. The
-    memory of ``capacity`` columns, the most there will ever be, is taken at once, 16 bytes a pixel and
-    column; ``paths_bytes`` of camera paths are kept for columns that are traced later.
-
-    ``texels`` (n,) int64 have a column, in the order of their slots. Of each texel of the grid, (H * W,),
-    ``slot_of`` is the slot of its column, -1 without one, ``paths_of`` the camera paths a pixel that it was
-    traced with, 0 without one, and ``mask`` (Float) 1 without a column, 0 with one: what is left to the
-    coarse tier.
+    ``paths`` (n,) int64 are the camera paths a pixel of each.
     """
 
-    def __init__(self, scene: Scene, grid: Grid, bounces: int, capacity: int, paths_bytes: int = 0):
+    texels: np.ndarray
+    paths: np.ndarray
+
+    @classmethod
+    def none(cls) -> Columns:
+        """Return no columns."""
+        return cls(np.zeros(0, np.int64), np.zeros(0, np.int64))
+
+    def __len__(self) -> int:
+        return len(self.texels)
+
+    def paths_of(self, texels: np.ndarray) -> np.ndarray:
+        """Return the paths of the columns of some texels, (n,); 0 of those without one."""
+        known = dict(zip(self.texels.tolist(), self.paths.tolist(), strict=True))
+        return np.array([known.get(texel, 0) for texel in texels.tolist()], np.int64)
+
+
+class Bound(NamedTuple):
+    """Columns as the kernels read them."""
+
+    slots: np.ndarray  # their places in the store
+    assigned: int  # how often the store had given slots away by then
+    # texel_of, slot_of: of each column; count: how many there are
+    texel_of: mi.UInt32
+    slot_of: mi.UInt32
+    count: mi.UInt32
+    mask: mi.Float  # (H * W,), 1 of texels without a column, 0 with one: what is left to the coarse tier
+
+
+class ColumnStore:
+    """Columns of T, traced when they are used; those used least lately make room.
+
+    Made for a scene, its camera and film, the texels of ``grid``, paths of ``bounces`` surface points and a
+    ``seed``, that of every random choice: a column of a texel with so many paths is always the same. The
+    memory of ``capacity`` columns is taken at once, 16 bytes a pixel and column; ``paths_bytes`` of camera
+    paths are kept for columns that are traced later.
+    """
+
+    def __init__(
+        self, scene: Scene, grid: Grid, bounces: int, capacity: int, seed: int, paths_bytes: int = 0
+    ):
         self.scene = scene
         self.grid = grid
         self.bounces = bounces
-        self.capacity = capacity
+        self.capacity = max(capacity, 1)
+        self.seed = seed
         self.pixels = scene.width * scene.height
-        self.texels = np.zeros(0, np.int64)
-        self.slot_of = np.full(grid.texels, -1, np.int64)
-        self.paths_of = np.zeros(grid.texels, np.int64)
-        self.mask = dr.full(mi.Float, 1, grid.texels)
-        self._store = dr.zeros(mi.Float, -(-self.pixels // SLICE) * max(capacity, 1) * SLICE * 4)
-        self._texel_of = dr.zeros(mi.UInt32, max(capacity, 1))
-        self._count = dr.opaque(mi.UInt32, 0)
-        self._lost = dr.opaque(mi.UInt32, 0)
         self.paths_bytes = paths_bytes
-        self._kept: dict[tuple[int, int], list[path_vertices.Block]] = {}
-        dr.make_opaque(self._store, self._texel_of, self.mask)
+        self._slot_of: dict[tuple[int, int], int] = {}  # of texel and paths
+        self._used = np.full(self.capacity, -1, np.int64)  # when each slot was used last; -1: it is free
+        self._uses = itertools.count()
+        self._assigned = 0
+        self._store = dr.zeros(mi.Float, -(-self.pixels // SLICE) * self.capacity * SLICE * 4)
+        self._lost = dr.opaque(mi.UInt32, 0)
+        self._kept: dict[int, list[path_vertices.Block]] = {}
+        dr.make_opaque(self._store)
 
     @property
     def bytes(self) -> int:
@@ -72,48 +108,93 @@ class ExactColumns:
         """Contributions that were not finite, and were left out."""
         return int(self._lost[0])
 
-    @property
-    def room(self) -> int:
-        """Columns that can still be added."""
-        return self.capacity - len(self.texels)
-
     # ---- tracing -------------------------------------------------------------------------------------------
 
-    def trace(
-        self,
-        texels: np.ndarray,
-        count: int,
-        seed: int,
-        keep: np.ndarray | None = None,
-        blocks: int | None = None,
-    ) -> None:
-        """Trace columns of distinct texels with so many camera paths a pixel, in place of older ones.
+    def bind(self, columns: Columns, bound: Bound | None = None) -> Bound:
+        """Return columns, at most :attr:`capacity`, as the kernels read them; traces those that are missing.
 
-        ``seed`` is that of every random choice. No more of the texels are new than there is :attr:`room` and
-        columns to give up. Texels in ``keep`` give their columns up last, the first of them last of all. Only
-        so many ``blocks`` of pixels are traced, if given: enough to have all kernels, but no column to be
-        used.
+        ``bound`` is what was returned for the same columns before; it is returned where it still holds.
         """
-        self._take_slots(texels[self.slot_of[texels] < 0], texels, keep)
-        self.paths_of[texels] = count
+        if bound is None or bound.assigned != self._assigned:
+            ascending = np.argsort(columns.texels)  # sums do not depend on the order
+            texels = columns.texels[ascending]
+            slots = self._slots(texels, columns.paths[ascending])
+            mask = np.ones(self.grid.texels, np.float32)
+            mask[texels] = 0
+            bound = Bound(
+                slots=slots,
+                assigned=self._assigned,
+                texel_of=dr.opaque(mi.UInt32(self._padded(texels))),
+                slot_of=dr.opaque(mi.UInt32(self._padded(slots))),
+                count=dr.opaque(mi.UInt32, len(texels)),
+                mask=dr.opaque(mi.Float(mask)),
+            )
+        self._used[bound.slots] = next(self._uses)
+        return bound
 
-        for block in itertools.islice(self._paths(count, seed), blocks):
+    def warm_up(self, texel: int, counts: tuple[int, ...]) -> None:
+        """Trace one column with each number of paths: what is traced later needs no other kernel.
+
+        Of the largest number only one block of pixels, and nothing is kept of it.
+        """
+        most = max(counts)
+        for count in sorted(set(counts), reverse=True):
+            (slot,) = self._free_slots(1, taken=np.zeros(0, np.int64))
+            self._trace(np.array([texel]), np.array([slot]), count, blocks=1 if count == most else None)
+
+    def _padded(self, numbers):
+        """Return numbers, at most :attr:`capacity`, with zeros: arrays of one length compile nothing."""
+        padded = np.zeros(self.capacity, np.uint32)
+        padded[: len(numbers)] = numbers
+        return padded
+
+    def _slots(self, texels, paths):
+        """Return the slots of columns; those that are missing are traced."""
+        keys = list(zip(texels.tolist(), paths.tolist(), strict=True))
+        slots = np.array([self._slot_of.get(key, -1) for key in keys], np.int64)
+        missing = np.flatnonzero(slots < 0)
+        if len(missing):
+            slots[missing] = self._free_slots(len(missing), taken=slots[slots >= 0])
+            for i in missing:
+                self._slot_of[keys[i]] = int(slots[i])
+            for count in np.unique(paths[missing])[::-1]:
+                some = missing[paths[missing] == count]
+                self._trace(texels[some], slots[some], int(count))
+        self._used[slots] = next(self._uses)
+        return slots
+
+    def _free_slots(self, count, taken):
+        """Return slots whose columns are used least lately, and forget these; none of those ``taken``."""
+        since = self._used.copy()
+        since[taken] = np.iinfo(np.int64).max
+        slots = np.argsort(since, kind="stable")[:count]
+        given_up = set(slots.tolist())
+        self._slot_of = {key: slot for key, slot in self._slot_of.items() if slot not in given_up}
+        self._used[slots] = -1
+        self._assigned += 1
+        return slots
+
+    def _trace(self, texels, slots, count, blocks=None):
+        """Trace columns of distinct texels with so many camera paths a pixel into slots.
+
+        Only so many ``blocks`` of pixels, if given: enough to have all kernels, but no column to be used.
+        """
+        for block in itertools.islice(self._paths(count), blocks):
             most = max(1, MOST_VALUES // max(block.vertices, 1))
             for start in range(0, len(texels), most):
-                self._add_vertices(block, texels[start : start + most], count, seed)
+                some = slice(start, start + most)
+                self._add_vertices(block, texels[some], slots[some], count)
             if block.escapes:
-                self._add_escapes(block, texels)
-        self._publish()
+                self._add_escapes(block, texels, slots)
 
-    def _paths(self, count, seed):
+    def _paths(self, count):
         """Yield blocks of the paths of a picture, kept from an earlier call where there is memory for it."""
-        if (count, seed) in self._kept:
-            yield from self._kept[count, seed]
+        if count in self._kept:
+            yield from self._kept[count]
             return
-        self._kept = {key: kept for key, kept in self._kept.items() if key[1] == seed}
         traced = []
         room = self.paths_bytes - self.kept_bytes
-        own = seeds.columns(seed)
+        own = seeds.columns(self.seed)
         for block in path_vertices.blocks(self.scene.mi, self.grid, self.pixels, count, self.bounces, own):
             traced.append(block)
             room -= block.bytes
@@ -121,66 +202,34 @@ class ExactColumns:
             if room < 0:
                 traced.clear()
         if room >= 0:
-            self._kept[count, seed] = traced
+            self._kept[count] = traced
 
-    def _add_vertices(self, block, texels, count, seed):
+    def _add_vertices(self, block, texels, slots, count):
         """Add what a block of paths contributes to columns by way of its vertices."""
-        value, lost = path_vertices.contributions(self.scene.mi, self.grid, block, texels, count, seed)
+        value, lost = path_vertices.contributions(self.scene.mi, self.grid, block, texels, count, self.seed)
         self._lost += lost
-        place = self._places(texels, block.pixels, dr.opaque(mi.UInt32, block.first)) * 4
-        for c in range(3):  # whatever the column held before is overwritten
+        place = self._places(slots, block.pixels, dr.opaque(mi.UInt32, block.first)) * 4
+        for c in range(3):  # whatever the slot held before is overwritten
             dr.scatter(self._store, value[c], place + c)
         dr.eval(self._store, self._lost)
 
-    def _places(self, texels, count, first):
-        """Return the packets of so many pixels of texels' columns, texel by texel."""
-        slots = path_vertices.on_device(mi.UInt32, (self.slot_of[texels] * SLICE).astype(np.uint32))
-        lane = dr.arange(mi.UInt32, len(texels) * count)
+    def _places(self, slots, count, first):
+        """Return the packets of so many pixels of columns, column by column."""
+        first_of = path_vertices.on_device(mi.UInt32, (slots * SLICE).astype(np.uint32))
+        lane = dr.arange(mi.UInt32, len(slots) * count)
         pixels = dr.opaque(mi.UInt32, count)
-        texel = lane // pixels
-        pixel = lane - texel * pixels + first
-        return _first_place(pixel, self.capacity) + dr.gather(mi.UInt32, slots, texel)
+        column = lane // pixels
+        pixel = lane - column * pixels + first
+        return _first_place(pixel, self.capacity) + dr.gather(mi.UInt32, first_of, column)
 
-    def _take_slots(self, fresh, texels, keep):
-        """Give slots to texels without one: new ones first, then those of columns that are given up."""
-        new = min(len(fresh), self.room)
-        slots = len(self.texels) + np.arange(new)
-        if new < len(fresh):
-            kept = np.append(texels, [] if keep is None else keep).astype(np.int64)
-            rank = np.full(self.grid.texels, len(kept))
-            rank[kept[::-1]] = np.arange(len(kept))[::-1]  # of a texel that is listed twice, the first place
-            given_up = np.argsort(-rank[self.texels], kind="stable")[: len(fresh) - new]
-            gone = self.texels[given_up]
-            self.slot_of[gone] = -1
-            self.paths_of[gone] = 0
-            slots = np.concatenate([slots, given_up])
-        self.texels = np.concatenate([self.texels, np.zeros(new, np.int64)])
-        self.texels[slots] = fresh
-        self.slot_of[fresh] = slots
-
-    def retrace(self, seed: int) -> None:
-        """Trace every column again with other samples, each with as many paths as before."""
-        paths_of = self.paths_of[self.texels]
-        for count in np.unique(paths_of)[::-1]:
-            self.trace(self.texels[paths_of == count], int(count), seed)
-
-    def _publish(self):
-        """Bring what the kernels read in line with the list of texels."""
-        padded = np.zeros(max(self.capacity, 1), np.uint32)
-        padded[: len(self.texels)] = self.texels
-        self._texel_of = dr.opaque(mi.UInt32(padded))
-        mask = np.ones(self.grid.texels, np.float32)
-        mask[self.texels] = 0
-        self.mask = dr.opaque(mi.Float(mask))
-        self._count = dr.opaque(mi.UInt32, len(self.texels))
-
-    def _add_escapes(self, block, texels):
+    def _add_escapes(self, block, texels, slots):
         """Add paths that left the scene towards some texels.
 
         Few do; they are summed on the host, in a fixed order.
         """
-        traced = np.zeros(self.grid.texels, bool)
-        traced[texels] = True
+        slot_of = np.full(self.grid.texels, -1, np.int64)
+        slot_of[texels] = slots
+        traced = slot_of >= 0
         is_traced = dr.opaque(mi.Bool(traced))
         hit = mi.Bool(False)
         for texel in block.texels:
@@ -194,9 +243,8 @@ class ExactColumns:
         )
         tap, escape = np.nonzero(traced[around] & (shares > 0))
         value = light[:, escape].T * shares[tap, escape, None]
-        texel = around[tap, escape]
         pixel = pixel[0, escape].astype(np.int64)
-        slot = self.slot_of[texel]
+        slot = slot_of[around[tap, escape]]
         target = (pixel // SLICE * self.capacity + slot) * SLICE + pixel % SLICE
         finite = np.isfinite(value).all(axis=1)
         self._lost += int((~finite).sum())
@@ -214,51 +262,47 @@ class ExactColumns:
 
     # ---- using ---------------------------------------------------------------------------------------------
 
-    def product(self, packets: mi.Float, count: int = 1) -> list[mi.Color3f]:
+    def read(self, columns: Columns) -> np.ndarray:
+        """Return columns, of any number, as (n, pixels, 3); in memory channel by channel."""
+        planes = np.zeros((3, len(columns), self.pixels), np.float32)
+        for start in range(0, len(columns), self.capacity):
+            some = slice(start, start + self.capacity)
+            slots = self._slots(columns.texels[some], columns.paths[some])
+            packets = dr.gather(mi.Vector4f, self._store, self._places(slots, self.pixels, 0))
+            dr.eval(packets)
+            for c in range(3):
+                planes[c, some] = packets[c].numpy().reshape(len(slots), self.pixels)
+        return planes.transpose(1, 2, 0)
+
+    def product(self, packets: mi.Float, bound: Bound, count: int = 1) -> list[mi.Color3f]:
         """Multiply with maps: sum over columns of column * E[texel], of each map one colour a pixel.
 
         ``packets`` are ``count`` maps, as :func:`.sparse_matrix.to_packets` interleaves them.
         """
-        return _product(self._store, packets, self._texel_of, self._count, self.pixels, self.capacity, count)
+        return _product(
+            self._store,
+            packets,
+            bound.texel_of,
+            bound.slot_of,
+            bound.count,
+            self.pixels,
+            self.capacity,
+            count,
+        )
 
-    def read(self, texels: np.ndarray) -> np.ndarray:
-        """Return the columns of texels that have one, (n, pixels, 3); in memory channel by channel."""
-        if not len(texels):
-            return np.zeros((0, self.pixels, 3), np.float32)
-        columns = dr.gather(mi.Vector4f, self._store, self._places(texels, self.pixels, 0))
-        dr.eval(columns)
-        planes = np.stack([columns[c].numpy() for c in range(3)])
-        return planes.reshape(3, len(texels), self.pixels).transpose(1, 2, 0)
-
-    def add_adjoint(self, flat: mi.Float, packets: mi.Float) -> None:
+    def add_adjoint(self, flat: mi.Float, packets: mi.Float, bound: Bound) -> None:
         """Put the adjoint, the sum over pixels of column * I, in the places of the texels that have a column.
 
         ``flat``, H * W * 3, is the map that is being pulled back to; ``packets`` the picture, 4 floats a
         pixel, (r, g, b, unused), flat.
         """
-        if not self.capacity:
-            return
-        part = _adjoint_parts(self._store, packets, self._count, self.pixels, self.capacity)
+        part = _adjoint_parts(self._store, packets, bound.slot_of, bound.count, self.pixels, self.capacity)
         dr.eval(part)
-        slot, total = dr.arange(mi.UInt32, self.capacity), mi.Color3f(0)
+        column, total = dr.arange(mi.UInt32, self.capacity), mi.Color3f(0)
         for segment in range(_SEGMENTS):
-            total += dr.gather(mi.Color3f, part, slot + dr.opaque(mi.UInt32, segment * self.capacity))
-        slot = dr.arange(mi.UInt32, self.capacity)
-        dr.scatter(flat, total, dr.gather(mi.UInt32, self._texel_of, slot), slot < self._count)
-
-    def state(self) -> dict:
-        """Return which texels have a column, in the order of their slots, and the paths of each."""
-        return {"columns": self.texels, "paths": self.paths_of[self.texels]}
-
-    def restore(self, state: dict, seed: int) -> None:
-        """Trace the columns of an earlier :meth:`state` again."""
-        # The same slots as before: the order of a sum is part of its result.
-        self.slot_of[:] = -1
-        self.paths_of[:] = 0
-        self.texels = state["columns"].astype(np.int64)
-        self.slot_of[self.texels] = np.arange(len(self.texels))
-        self.paths_of[self.texels] = state["paths"]
-        self.retrace(seed)
+            total += dr.gather(mi.Color3f, part, column + dr.opaque(mi.UInt32, segment * self.capacity))
+        column = dr.arange(mi.UInt32, self.capacity)
+        dr.scatter(flat, total, dr.gather(mi.UInt32, bound.texel_of, column), column < bound.count)
 
 
 # ---- kernels -----------------------------------------------------------------------------------------------
@@ -270,30 +314,29 @@ def _first_place(pixel, capacity):
 
 
 @dr.syntax
-def _product(store, packets, texel_of, columns, pixels, capacity, count):
-    place = _first_place(dr.arange(mi.UInt32, pixels), capacity)
-    slot = dr.zeros(mi.UInt32, pixels)
+def _product(store, packets, texel_of, slot_of, columns, pixels, capacity, count):
+    first = _first_place(dr.arange(mi.UInt32, pixels), capacity)
+    column = dr.zeros(mi.UInt32, pixels)
     total = [mi.Color3f(0) for _ in range(count)]
-    while slot < columns:
-        weight = dr.gather(mi.Vector4f, store, place)
-        total = add_products(total, weight, packets, dr.gather(mi.UInt32, texel_of, slot))
-        place += SLICE
-        slot += 1
+    while column < columns:
+        weight = dr.gather(mi.Vector4f, store, first + SLICE * dr.gather(mi.UInt32, slot_of, column))
+        total = add_products(total, weight, packets, dr.gather(mi.UInt32, texel_of, column))
+        column += 1
     return total
 
 
 @dr.syntax
-def _adjoint_parts(store, packets, count, pixels, capacity):
+def _adjoint_parts(store, packets, slot_of, columns, pixels, capacity):
     """Sum of column * picture over the pixels of each segment; segments occupy every core."""
-    # Neighbouring lanes are neighbouring columns: their weights for a pixel lie 8 packets apart and share
-    # cache lines with the next 7 pixels.
+    # Lanes are columns: their weights for a pixel share cache lines with the next 7 pixels.
     lane = dr.arange(mi.UInt32, capacity * _SEGMENTS)
     size = dr.opaque(mi.UInt32, capacity)
-    slot, segment = lane % size, lane // size
+    column, segment = lane % size, lane // size
+    slot = dr.gather(mi.UInt32, slot_of, column)
     each = -(-pixels // (_SEGMENTS * SLICE)) * SLICE
     pixel = segment * dr.opaque(mi.UInt32, each)
     stop = dr.minimum(pixel + dr.opaque(mi.UInt32, each), dr.opaque(mi.UInt32, pixels))
-    stop = dr.select(slot < count, stop, 0)
+    stop = dr.select(column < columns, stop, 0)
     stride = size * SLICE
     total = mi.Color3f(0)
     while pixel < stop:

@@ -10,14 +10,16 @@ Two tiers, both unbiased for paths up to the path depth:
   directions; it renders the smooth part of a map with little error, but a single bright texel is hit by few
   samples;
 * the **exact** tier holds columns of T (``exact_columns.py``), one ray per path vertex to that very texel.
-  :meth:`LightTransport.resolve` adds them for the texels that are bright in a given map.
+  :meth:`LightTransport.resolved` adds them for the texels that are bright in a given map.
 
 T E = T_coarse (E outside the columns) + T_exact (E inside them). What it costs follows the light, not the
-grid.
+grid. A transport is a value: what it renders depends on the map alone. Others that differ in their columns
+share its recording and the columns in memory, which are traced when they are used first.
 """
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping
 from numbers import Integral
 from os import PathLike
@@ -39,21 +41,17 @@ from envedit.scene import built_scene
 from envedit.scene.scene import Scene
 from envedit.transport import bright_texels, sampling_plan
 from envedit.transport.block_transport import Overview
-from envedit.transport.exact_columns import ExactColumns
+from envedit.transport.exact_columns import Bound, Columns, ColumnStore
 from envedit.transport.influence import determined
 from envedit.transport.recording import other_light, record_all
-from envedit.transport.sampling_plan import COLUMN_PATHS, FEW_PATHS, SamplingPlan
+from envedit.transport.sampling_plan import COLUMN_PATHS, COLUMNS_STORED, FEW_PATHS, SamplingPlan
 from envedit.transport.sparse_matrix import ColourMatrix, scale_packets, to_packets
 from envedit.transport.texel_sampling import Grid
 
 COLUMN_SHARES = (0.0, 0.01, 0.1)
 """Shares of the picture's light from which on a column has so many paths (:data:`.COLUMN_PATHS`)."""
-RESOLVE_EVERY = 10
-"""Steps after which a renderer looks for texels that have grown bright."""
-LASTING_LOOKS = 5
-"""Looks in a row at which a texel must have been a main light before a renderer spends most paths on it."""
 COLUMNS_A_LOOK = 32
-"""Columns that a renderer traces per update, the brightest; transient speckle is ignored."""
+"""Columns that an edit traces for a map at once, the brightest; transient speckle is ignored."""
 LEAST_LIGHT = 1 / 256
 """Light of a texel, as a share of the brightest's, below which it gets no column for a picture of its own."""
 TYPICAL_PIXELS = 128 * 128
@@ -75,10 +73,12 @@ class LightTransport:
         Height and width of the picture.
     spp, bounces, capacity : int
         Paths a pixel of the coarse tier, surface points along a path, most exact columns.
+    exact : Columns
+        Which columns are exact.
     depth_error : float
         Share of the picture under a white sky that comes from deeper paths.
     epoch : int
-        Number of the present recording; only a ``refresh`` raises it.
+        Number of the recording: others are independent estimates of the same T (:meth:`recorded_again`).
     cached : bool
         The first recording was found on disk.
     paths, tolerance : (int, int, int), float
@@ -87,14 +87,13 @@ class LightTransport:
         What the user should know: how much light comes by longer paths.
     """
 
-    def __init__(self, scene: Scene, grid: Grid, plan: SamplingPlan, seed: int, refresh: int):
+    def __init__(self, scene: Scene, grid: Grid, plan: SamplingPlan, seed: int):
         self.scene = scene
         self.grid = grid
         self.shape = (scene.height, scene.width)
         self.spp = plan.spp
         self.bounces = plan.bounces
         self.capacity = plan.capacity
-        self.refresh = refresh
         self.epoch = 0
         self._base_seed = seed
         self._choices = plan.choices
@@ -104,13 +103,22 @@ class LightTransport:
         self.warnings = plan.warnings
         self.paths = plan.paths
         self.tolerance = plan.tolerance
-        self._looks = np.zeros(grid.texels, np.uint8)
-        # Texels that were bright in the map that was resolved last; with those of maps before, last first
-        self._bright: np.ndarray = np.zeros(0, np.int64)
-        self._recent: np.ndarray = np.zeros(0, np.int64)
+        self.exact = Columns.none()
+        self._bound: Bound | None = None
         self._overview: Overview | None = None
         self._stored: tuple[DiskCache, dict[str, Any]] = DiskCache(None), {}
-        self._exact = ExactColumns(scene, grid, plan.bounces, plan.capacity, plan.paths_bytes)
+        self._paths_bytes = plan.paths_bytes
+        self._store = self._empty_store()
+
+    def _empty_store(self):
+        return ColumnStore(
+            scene=self.scene,
+            grid=self.grid,
+            bounces=self.bounces,
+            capacity=COLUMNS_STORED * self.capacity,
+            seed=self.seed,
+            paths_bytes=self._paths_bytes,
+        )
 
     # ---- building ------------------------------------------------------------------------------------------
 
@@ -125,7 +133,6 @@ class LightTransport:
         max_depth: int | str = "auto",
         seed: int = 0,
         memory_gb: float | str = 2.0,
-        refresh: int = 0,
         few: bool = False,
         folder: Path | None = None,
         progress: Progress | None = None,
@@ -148,13 +155,10 @@ class LightTransport:
             Seed of the recording.
         memory_gb : float or "auto"
             Bound on the memory of T; "auto": 2.
-        refresh : int
-            Steps after which :meth:`render` records T afresh; 0: never.
         few : bool
             The maps have few parameters: exact columns need fewer paths, and fewer texels have one.
         folder : Path, optional
-            Where recordings are kept under a hash of all they depend on; None: nowhere. Recordings made by
-            ``refresh`` are not kept: they are there to be new.
+            Where the recording is kept under a hash of all it depends on; None: nowhere.
         progress : callable, optional
             Called with (done, total) pixel blocks.
 
@@ -200,7 +204,7 @@ class LightTransport:
         grid = height, width
         light = sampling_plan.white_sky(cache, origin | {"part": "pilot"}, scene, grid, seed)
         plan = sampling_plan.choose(scene, grid, light, spp, max_depth, memory_gb, few)
-        transport = cls(scene, Grid(height, width, scene.to_world, plan.mass), plan, seed, refresh)
+        transport = cls(scene, Grid(height, width, scene.to_world, plan.mass), plan, seed)
 
         # ---- The recording, from disk or traced
         key = origin | {"part": "recording"} | plan.key()
@@ -228,6 +232,17 @@ class LightTransport:
         self.reverse = ColourMatrix(columns, rows, weights, (texels, pixels))
         influence = np.bincount(columns, weights.astype(np.float64).mean(axis=1), minlength=texels)
         self.influence = influence.reshape(self.grid.shape).astype(np.float32)
+
+    def recorded_again(self, epoch: int) -> LightTransport:
+        """Return another recording of the same T, by its number, with as many exact columns as this one."""
+        other = copy.copy(self)
+        other.epoch = epoch
+        other._record()
+        other._lost += self._store.lost
+        other._bound, other._overview = None, None
+        other._stored = DiskCache(None), {}
+        other._store = other._empty_store()
+        return other
 
     def _recording(self):
         """Return the first recording as arrays, for :meth:`_take`."""
@@ -271,7 +286,7 @@ class LightTransport:
     @property
     def choices(self) -> list[str]:
         """What was chosen automatically with the measurement that decided, and what was left out of T."""
-        count = self._lost + self._exact.lost
+        count = self._lost + self._store.lost
         if not count:
             return list(self._choices)
         lost = counted(count, "contribution of a camera path", "contributions of camera paths")
@@ -279,13 +294,13 @@ class LightTransport:
 
     @property
     def columns(self) -> np.ndarray:
-        """Texels that have an exact column, int64 (n,), in the order of their places in memory."""
-        return self._exact.texels
+        """Texels that have an exact column, int64 (n,)."""
+        return self.exact.texels
 
     @property
     def memory_bytes(self) -> int:
         """Bytes held by both tiers, without the camera paths that are kept for further columns."""
-        return self.forward.bytes + self.reverse.bytes + self._exact.bytes
+        return self.forward.bytes + self.reverse.bytes + self._store.bytes
 
     def summary(self) -> dict:
         """Return what T consists of, by name, for metrics.json."""
@@ -306,7 +321,7 @@ class LightTransport:
 
     def release(self) -> None:
         """Let go of T's memory; nothing can be asked of it afterwards."""
-        del self.forward, self.reverse, self._exact
+        del self.forward, self.reverse, self._store
 
     def overview(self) -> Overview:
         """Return T between blocks of pixels and cells of texels; summed up once and kept on disk."""
@@ -323,16 +338,11 @@ class LightTransport:
 
     # ---- using ---------------------------------------------------------------------------------------------
 
-    @property
-    def transport(self) -> LightTransport:
-        """Itself: what a renderer renders through, where that is a stored T."""
-        return self
-
     def apply(self, envmap: mi.TensorXf | np.ndarray) -> mi.TensorXf:
         """Render a map: I = T E + I_0, differentiable in a tensor.
 
-        What a texel lights is exact to Monte Carlo noise where the map is smooth; for one with a sun call
-        :meth:`resolve` before.
+        What a texel lights is exact to Monte Carlo noise where the map is smooth; for one with a sun ask
+        that of :meth:`resolved`.
 
         Parameters
         ----------
@@ -370,101 +380,34 @@ class LightTransport:
         """Render maps that are black but for few texels, without the light of other lamps.
 
         ``maps`` (k, rows, W, 3) are radiance in some ``rows``, of any sign. Costs what their texels cost, not
-        what T does. The texels with most light, at most ``most``, get exact columns. Returns (k, h, w, 3)
-        float32, in memory channel by channel.
+        what T does. The texels with most light, at most ``most``, are rendered by columns with the fewest
+        paths where they have none. Returns (k, h, w, 3) float32, in memory channel by channel.
         """
         flat = maps.reshape(len(maps), -1, 3)
         some = np.flatnonzero(flat.any(axis=(0, 2)))
         texels = some + rows.start * self.grid.width
         values = flat[:, some]
-        self._trace_main(texels, values, most)
-        exact = self._exact.slot_of[texels] >= 0
+        paths = self.exact.paths_of(texels)
+        main = np.isin(texels, self.main(maps, rows, most))
+        paths[main] = np.maximum(paths[main], self.paths[0])
+        exact = paths > 0
         total = self.reverse.transposed(texels[~exact], values[:, ~exact])
         if exact.any():
-            columns = self._exact.read(texels[exact])
+            columns = self._store.read(Columns(texels[exact], paths[exact]))
             for c in range(3):
                 total[..., c] += values[:, exact, c] @ columns[..., c]
         return total.reshape(len(maps), *self.shape, 3)
 
-    def _trace_main(self, texels, values, most):
-        """Trace columns, with the fewest paths, of the main texels of maps (k, texels, 3) that have none.
-
-        None takes the place of a texel that is bright in the map that was resolved last.
-        """
-        exact = self._exact
-        light = np.abs(values).sum(axis=(0, 2), dtype=np.float64) * self.influence.ravel()[texels]
-        order = np.argsort(-light, kind="stable")[:most]
-        main = texels[order[light[order] > light.max(initial=0) * LEAST_LIGHT]]
-        todo = main[exact.slot_of[main] < 0]
-        kept = np.union1d(main, self._bright)
-        todo = todo[: max(exact.capacity - len(np.setdiff1d(kept, todo)), 0)]
-        if len(todo):
-            exact.trace(todo, self.paths[0], self.seed, np.concatenate([main, self._recent]))
+    def main(self, maps: np.ndarray, rows: slice, most: int = COLUMNS_A_LOOK) -> np.ndarray:
+        """Return the texels with most light in the picture, of maps as :meth:`pictures` has them."""
+        light = np.abs(maps).sum(axis=(0, 3), dtype=np.float64) * self.influence[rows]
+        order = np.argsort(-light.ravel(), kind="stable")[:most]
+        main = order[light.ravel()[order] > light.max(initial=0) * LEAST_LIGHT]
+        return main + rows.start * self.grid.width
 
     def adjoint(self, image: mi.TensorXf | np.ndarray) -> mi.TensorXf:
         """Pull a picture (h, w, 3) back to the map: T' I, (H, W, 3); InputError for another shape."""
         return self._adjoint(_as_tensor(image, (*self.shape, 3), "picture"))
-
-    def render(self, envmap: mi.TensorXf, step: int) -> mi.TensorXf:
-        """Render a map: the interface that all renderers share.
-
-        T does not depend on the step; but now and then it is checked whether the map has grown bright where
-        T is coarse, and with ``refresh`` everything is recorded again: a new, independent estimate of the
-        same T.
-        """
-        if self.refresh and step // self.refresh != self.epoch:
-            self.epoch = step // self.refresh
-            self._record()
-            self._exact.retrace(self.seed)
-        if step % RESOLVE_EVERY == 0:
-            self._warm_up()
-            self._look(dr.detach(envmap).numpy())
-        return self.apply(envmap)
-
-    def _look(self, envmap):
-        """Trace columns for a map that will still change: moving lights get fewer paths than lasting ones."""
-        is_main = self._shares(envmap) > COLUMN_SHARES[-1]
-        self._looks = np.where(is_main, np.minimum(self._looks, LASTING_LOOKS) + 1, 0).astype(np.uint8)
-        self.resolve(envmap, limit=COLUMNS_A_LOOK, lasting=self._looks >= LASTING_LOOKS)
-
-    def _warm_up(self):
-        """Trace one column of each kind in the first step: what grows bright later needs no other kernel."""
-        if len(self.columns) == 0 and self._exact.room:
-            most = np.array([int(self.influence.argmax())])
-            self._exact.trace(most, self.paths[-1], self.seed, blocks=1)
-            for count in self.paths[:-1]:
-                self._exact.trace(most, count, self.seed)
-
-    def state(self) -> dict:
-        """Return what a checkpoint must hold.
-
-        The exact columns, their order and paths; looks; bright texels, which keep their columns; and epoch.
-        """
-        bright = {"bright": self._bright, "recent": self._recent}
-        return {**self._exact.state(), "looks": self._looks, **bright, "epoch": np.int64(self.epoch)}
-
-    def restore(self, state: dict) -> None:
-        """Trace the columns of an earlier :meth:`state`; InputError if it is no state of such a transport."""
-        own = {k: np.asarray(v) for k, v in state.items()}
-        arrays = "columns", "paths", "looks", "bright", "recent"
-        kept = {name: (own[name].dtype, (None,)) for name in arrays if name in own}
-        if not (
-            own.keys() == {*arrays, "epoch"}
-            and holds(own, kept | {"epoch": ("i8", ())})
-            and all(a.dtype.kind in "iu" for a in own.values())
-            and len(own["columns"]) == len(own["paths"]) == len(np.unique(own["columns"])) <= self.capacity
-            and len(own["looks"]) == self.grid.texels
-            and 0 <= own["epoch"] < 2**31
-            and all(_within(own[name], 0, self.grid.texels - 1) for name in ("columns", "bright", "recent"))
-            and _within(own["paths"], 1, max(*COLUMN_PATHS, *FEW_PATHS))
-        ):
-            raise InputError("checkpoint: its columns are not of this light transport; run without --resume")
-        if int(state["epoch"]) != self.epoch:
-            self.epoch = int(state["epoch"])
-            self._record()
-        self._looks = np.array(state["looks"], np.uint8)
-        self._bright, self._recent = (own[name].astype(np.int64) for name in ("bright", "recent"))
-        self._exact.restore(state, self.seed)
 
     def _apply(self, envmap, offset=True):
         flat = self._products(envmap)
@@ -473,38 +416,72 @@ class LightTransport:
     def _products(self, maps, count=1):
         """T times maps, flat."""
         packets = to_packets(maps.array, self.grid.texels, count)
-        masked = scale_packets(packets, self._exact.mask, self.grid.texels, count)
-        both = zip(self.forward.apply(masked, count), self._exact.product(packets, count), strict=True)
+        self._bound = self._store.bind(self.exact, self._bound)
+        masked = scale_packets(packets, self._bound.mask, self.grid.texels, count)
+        exact = self._store.product(packets, self._bound, count)
+        both = zip(self.forward.apply(masked, count), exact, strict=True)
         pictures = [dr.ravel(coarse + exact) for coarse, exact in both]
         return pictures[0] if count == 1 else dr.concat(pictures)
 
     def _adjoint(self, image):
         packets = to_packets(image.array, self.shape[0] * self.shape[1])
+        self._bound = self._store.bind(self.exact, self._bound)
         (coarse,) = self.reverse.apply(packets)
-        coarse *= self._exact.mask
+        coarse *= self._bound.mask
         flat = dr.ravel(coarse)
-        self._exact.add_adjoint(flat, packets)
+        self._store.add_adjoint(flat, packets, self._bound)
         return mi.TensorXf(flat, (*self.grid.shape, 3))
 
     # ---- which texels are exact ----------------------------------------------------------------------------
 
     def probe(self, texels: np.ndarray) -> np.ndarray:
-        """Trace columns with the fewest paths, where there are none, and return them: (n, pixels, 3)."""
-        exact = self._exact
-        texels = np.asarray(texels, np.int64)
-        todo = texels[exact.slot_of[texels] < 0]
-        if len(todo):
-            exact.trace(todo, self.paths[0], self.seed, np.concatenate([texels, self._recent]))
-        return exact.read(texels)
+        """Return the columns of texels, of those without one with the fewest paths: (n, pixels, 3)."""
+        return self._store.read(self._probed(texels))
 
-    def resolve(
+    def _probed(self, texels):
+        texels = np.asarray(texels, np.int64)
+        return Columns(texels, np.maximum(self.exact.paths_of(texels), self.paths[0]))
+
+    def with_probed(self, texels: np.ndarray) -> LightTransport:
+        """Return T with exact columns for distinct texels, of those without one with the fewest paths."""
+        return self._with_first(self._probed(texels))
+
+    def with_columns(self, exact: Columns) -> LightTransport:
+        """Return T with these exact columns, and no others; the first of them where there are too many."""
+        other = copy.copy(self)
+        other.exact = Columns(exact.texels[: self.capacity], exact.paths[: self.capacity])
+        other._bound = None
+        return other
+
+    def restored(self, exact: Columns) -> LightTransport:
+        """Return what :meth:`with_columns` does of columns from a file; InputError if they cannot be T's."""
+        if not (
+            exact.texels.ndim == exact.paths.ndim == 1
+            and exact.texels.dtype.kind in "iu"
+            and exact.paths.dtype.kind in "iu"
+            and len(exact.texels) == len(exact.paths) == len(np.unique(exact.texels))
+            and len(exact) <= self.capacity
+            and _within(exact.texels, 0, self.grid.texels - 1)
+            and _within(exact.paths, 1, max(*COLUMN_PATHS, *FEW_PATHS))
+        ):
+            raise InputError("checkpoint: its columns are not of this light transport; run without --resume")
+        return self.with_columns(Columns(exact.texels.astype(np.int64), exact.paths.astype(np.int64)))
+
+    def _with_first(self, first):
+        """Return T with some columns in place of its own, and then its own, while there is room."""
+        rest = ~np.isin(self.exact.texels, first.texels)
+        texels = np.concatenate([first.texels, self.exact.texels[rest]])
+        paths = np.concatenate([first.paths, self.exact.paths[rest]])
+        return self.with_columns(Columns(texels, paths))
+
+    def resolved(
         self,
         envmap: ArrayLike,
         tolerance: float | None = None,
         limit: int | None = None,
         lasting: np.ndarray | None = None,
-    ) -> int:
-        """Trace exact columns for the texels that the coarse tier would render with too much error.
+    ) -> LightTransport:
+        """Return T with exact columns for the texels that the coarse tier would render with too much error.
 
         The brightest texels are taken out until the error that is predicted for the rest
         (:mod:`.bright_texels`) stays under ``tolerance``.
@@ -516,15 +493,15 @@ class LightTransport:
         tolerance : float, optional
             Relative error allowed for the coarse part; :attr:`tolerance` by default.
         limit : int, optional
-            Trace at most so many new columns.
+            Take at most so many new columns.
         lasting : ndarray of bool (H * W,), optional
             Texels that may have the most paths; all by default.
 
         Returns
         -------
-        int
-            Number of columns traced. Texels stay exact while there is room; then those make room that have
-            been bright in no map for longest.
+        LightTransport
+            The columns of this one stay while there is room; then those make room that have been bright in
+            no map for longest.
 
         Raises
         ------
@@ -532,26 +509,30 @@ class LightTransport:
             The map has another shape, is no array of numbers, or is masked.
         """
         envmap = _as_array(envmap, (*self.grid.shape, 3), "map")
-        exact = self._exact
-        bright = self._bright = self.bright_texels(envmap, tolerance)[: exact.capacity]
-        before = self._recent[~np.isin(self._recent, bright)]
-        self._recent = np.concatenate([bright, before])[: exact.capacity]
-        tier = np.searchsorted(COLUMN_SHARES, self._shares(envmap)[bright], side="left") - 1
+        bright = self.bright_texels(envmap, tolerance)[: self.capacity]
+
+        # ---- Paths by a texel's share of the picture's light
+        tier = np.searchsorted(COLUMN_SHARES, self.shares(envmap)[bright], side="left") - 1
         tier = np.maximum(tier, 0)
         if lasting is not None:
             # The last tier is for lights that have lasted; others stop one below.
             tier = np.minimum(tier, np.where(lasting[bright], len(self.paths), len(self.paths) - 2))
-        traced = 0
-        for i in reversed(range(len(self.paths))):
-            todo = bright[(tier == i) & (exact.paths_of[bright] < self.paths[i])]
-            todo = todo[: None if limit is None else limit - traced]
-            if len(todo):
-                exact.trace(todo, self.paths[i], self.seed, self._recent)
-                traced += len(todo)
-        return traced
+        paths = self.exact.paths_of(bright)
+        wanted = np.asarray(self.paths)[tier]
 
-    def _shares(self, envmap):
-        """Return the share of the picture's light that comes from each texel, (H * W,)."""
+        # ---- New ones, those with most paths first
+        new = np.flatnonzero(paths < wanted)
+        new = new[np.argsort(-tier[new], kind="stable")][:limit]
+        paths[new] = wanted[new]
+        return self._with_first(Columns(bright[paths > 0], paths[paths > 0]))
+
+    def warm_up(self) -> None:
+        """Trace one column of each kind: what grows bright later needs no other kernel."""
+        if self.capacity:
+            self._store.warm_up(int(self.influence.argmax()), self.paths)
+
+    def shares(self, envmap: np.ndarray) -> np.ndarray:
+        """Return the share of the picture's light that comes from each texel of a map, (H * W,)."""
         light = envmap.reshape(-1, 3).astype(np.float64).mean(axis=1) * self.influence.ravel()
         total = light.sum()
         return light / total if total > 0 else np.zeros_like(light)
@@ -567,7 +548,8 @@ class LightTransport:
         """
         envmap = _as_array(envmap, (*self.grid.shape, 3), "map")
         require_radiance(envmap, "light transport")
-        rest = self._exact.slot_of < 0
+        rest = np.ones(self.grid.texels, bool)
+        rest[self.columns] = False
         radiance, omega = self._radiance(envmap)
         return bright_texels.error(radiance, omega, self._samples, rest)
 
@@ -584,7 +566,7 @@ class LightTransport:
         return envmap.reshape(-1, 3).astype(np.float64).max(axis=1) * reached, omega * reached
 
     def bright_texels(self, envmap: np.ndarray, tolerance: float | None = None) -> np.ndarray:
-        """List the texels that must be exact for this map, brightest first (see :meth:`resolve`)."""
+        """List the texels that must be exact for this map, brightest first (see :meth:`resolved`)."""
         tolerance = self.tolerance if tolerance is None else tolerance
         radiance, omega = self._radiance(envmap)
         return bright_texels.brightest(radiance, omega, self._samples, tolerance)

@@ -35,11 +35,13 @@ PILOT_SPP = 16
 """Paths a pixel of the pilot, whose sums over rows and bounces are of the whole picture."""
 MOST_COLUMNS = 256
 """Exact columns at most: an edit with so many ends where one with 768 does, in two thirds of the time."""
+COLUMNS_STORED = 2
+"""Columns in memory for each that a rendering may use: a step is tried beside where it begins."""
 COLUMN_TOLERANCE = 0.03
 """Relative error of the coarse tier above which columns are added."""
 COLUMN_PATHS = (8, 48, 320)
 """Paths a pixel of a column, by its texel's share of the picture's light (``COLUMN_SHARES``)."""
-FEW_PATHS, FEW_TOLERANCE = (8, 16, 48), 0.08
+FEW_PATHS, FEW_TOLERANCE = (16, 32, 64), 0.08
 """Likewise and :data:`COLUMN_TOLERANCE` for maps of few parameters, which cannot follow a column's noise."""
 
 
@@ -211,7 +213,8 @@ def choose_samples(scene: Scene, spp: int | str, texels: int, memory_gb: float) 
             "or [scene] width"
         )
     counted = (2**32 - 1) // (4 * (pixels + SLICE))  # an index into their store has 32 bits
-    capacity = int(min(MOST_COLUMNS, (memory_gb - coarse_gb) * 1e9 / (16 * pixels), texels, counted))
+    stored = min((memory_gb - coarse_gb) * 1e9 / (16 * pixels), counted)
+    capacity = int(min(MOST_COLUMNS, stored / COLUMNS_STORED, texels))
     about = gigabytes(pixels, spp, capacity)
     columns = f"up to {capacity} exact columns, about {about:.2g} of {memory_gb:g} GB"
     return spp, capacity, f"light transport: {spp} paths a pixel, {columns}"
@@ -239,7 +242,7 @@ def most_samples(pixels: int, memory_gb: float) -> int:
 
 def gigabytes(pixels: int, spp: int, columns: int = 0) -> float:
     """Estimate the GB of T, its transpose and columns: 16 bytes an entry, and a path leaves about 1.5."""
-    return pixels * (spp * 1.5 * 2 + columns) * 16 / 1e9
+    return pixels * (spp * 1.5 * 2 + COLUMNS_STORED * columns) * 16 / 1e9
 
 
 def _automatic_spp(pixels):

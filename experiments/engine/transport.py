@@ -18,9 +18,11 @@ import mitsuba as mi
 import numpy as np
 
 from envedit.inputs import load_map
+from envedit.renderers import RESOLVE_EVERY
 from envedit.scene import scene
 from envedit.scene.path_tracer import AUTO_DEPTH, PathTracer
-from envedit.transport.light_transport import RESOLVE_EVERY, LightTransport
+from envedit.transport.light_transport import LightTransport
+from envedit.transport.sampling_plan import COLUMNS_STORED
 
 from . import floors
 from .timing import compiled, side_by_side
@@ -57,7 +59,8 @@ def measure(
     gc.collect()
     transport, again = build(lit, height, width, settings.renderer)
     start = time.perf_counter()
-    transport.resolve(sky)
+    transport = transport.resolved(sky)
+    transport.apply(sky)
     resolve = time.perf_counter() - start
 
     # ---- products and steps ------------------------------------------------------------------------------
@@ -75,7 +78,7 @@ def measure(
             "adjoint": lambda: transport.adjoint(weight),
             "step": lambda: gradient(transport.apply, env, weight),
             # Every time, as in an edit: the map is read back to the host.
-            "look": lambda: transport.resolve(dr.detach(env).numpy()),
+            "look": lambda: transport.resolved(dr.detach(env).numpy()).apply(env),
             "prb": lambda: gradient(lambda e: tracer.render(e, next(steps)), env, weight),
         },
         3 if quick else 7,
@@ -175,7 +178,7 @@ def bytes_read(transport: LightTransport) -> int:
     """Count the bytes that T E and T' I have to read: entries, columns in use, map and picture once each."""
     entries = transport.forward.bytes + transport.reverse.bytes
     stored = transport.memory_bytes - entries
-    columns = stored * len(transport.columns) // max(transport.capacity, 1)
+    columns = stored * len(transport.columns) // max(COLUMNS_STORED * transport.capacity, 1)
     vectors = 12 * (transport.grid.texels + transport.shape[0] * transport.shape[1])
     return entries + 2 * (columns + vectors)
 
@@ -246,8 +249,7 @@ def without_caustics(lit, sky: np.ndarray, spp: int) -> list[dict]:
     chance, so that neither T nor the reference converges there. With two segments there is none; what stays
     hard is the sun's own image in the mirror, smaller than a pixel, which is why the pixels are kept apart.
     """
-    transport = LightTransport.build(lit, *sky.shape[:2], max_depth=2)
-    transport.resolve(sky)
+    transport = LightTransport.build(lit, *sky.shape[:2], max_depth=2).resolved(sky)
     halves = reference(lit, sky, spp, depth=2)
     got = transport.apply(mi.TensorXf(sky)).numpy()
     mirror = sees_mirror(lit)

@@ -20,6 +20,7 @@ from envedit.core import array_cache
 from envedit.core.errors import EnveditError
 from envedit.images import images
 from envedit.losses.perceptual import weights
+from envedit.renderers import StoredRenderer
 from envedit.scene import scene
 from envedit.solve import checkpoint
 from envedit.targets import painted_image
@@ -177,7 +178,7 @@ def read_checkpoint(path: Path, index: int) -> None:
     found = checkpoint.load(path.parent, "what")
     _demand(found is not None, "no checkpoint")
     try:
-        whole.transport()[1].restore(found[2])
+        StoredRenderer(whole.transport()[1]).restore(found[2])
     except EnveditError as error:
         raise type(error)(f"{path}: {error}") from None
 

@@ -322,8 +322,6 @@ def checkpoint_files() -> dict[str, bytes]:
         "columns": np.array([3, 9]),
         "paths": np.array([8, 48]),
         "looks": np.zeros(8 * 16, np.uint8),
-        "bright": np.array([3]),
-        "recent": np.array([3]),
         "epoch": np.int64(0),
     }
     with tempfile.TemporaryDirectory() as folder:

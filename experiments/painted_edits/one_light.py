@@ -46,8 +46,7 @@ def share(settings, view: View, initial: np.ndarray, paint: Paint) -> float:
     """
     # ---- Pictures of the map without its lights, and of each of these
     envmap = view.envmap
-    transport = renderers.trace(settings, view.scene, envmap.shape[:2])
-    transport.resolve(envmap)
+    transport = renderers.trace(settings, view.scene, envmap.shape[:2]).resolved(envmap)
     separated = separate(envmap)
     parts = [envmap - separated.core]
     for light in separated.lights:

@@ -17,6 +17,7 @@ from envedit.core.seeds import Seeds
 from envedit.export import adjustments
 from envedit.images import images
 from envedit.losses import losses, optimizer
+from envedit.renderers import StoredRenderer
 from envedit.scene import scene
 from envedit.solve import adam_loop
 from envedit.transport.light_transport import LightTransport
@@ -269,12 +270,12 @@ def test_the_path_tracer_hides_no_bad_slope(tmp_path, rng, monkeypatch):
 
 
 def spoil_renderer(monkeypatch, steps):
-    render = LightTransport.render
+    render = StoredRenderer.render
 
     def spoiled(self, envmap, step):
         return render(self, envmap, step) * dr.opaque(mi.Float, math.nan if step in steps else 1)
 
-    monkeypatch.setattr(LightTransport, "render", spoiled)
+    monkeypatch.setattr(StoredRenderer, "render", spoiled)
 
 
 @pytest.mark.slow

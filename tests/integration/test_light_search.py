@@ -47,8 +47,7 @@ def sky(*suns, flux=3.0):
 
 
 def picture(transport, image):
-    transport.resolve(image)
-    return transport.apply(mi.TensorXf(image)).numpy()
+    return transport.resolved(image).apply(mi.TensorXf(image)).numpy()
 
 
 class Found:

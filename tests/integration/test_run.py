@@ -23,6 +23,7 @@ from envedit.cli.progress import Progress
 from envedit.core.color import tonemap
 from envedit.images import images
 from envedit.losses.perceptual import installed
+from envedit.renderers import StoredRenderer
 from envedit.solve import adam_loop
 from envedit.transport.light_transport import LightTransport
 from tests.oracles import ROOT
@@ -449,7 +450,7 @@ def test_an_interrupt_after_the_last_iteration_costs_none(tmp_path, rng, capsys,
         patch.setattr(Progress, "stage", interrupting("rendering the result"))
         assert call(path, "--quiet") == 130
     assert "--resume" in capsys.readouterr().err and "checkpoint.npz" in names(out)
-    monkeypatch.setattr(LightTransport, "render", lambda self, envmap, step: 1 / 0)
+    monkeypatch.setattr(StoredRenderer, "render", lambda self, envmap, step: 1 / 0)
     assert call(path, "--quiet", "--resume") == 0
     assert pixels(out / "edited.exr").tobytes() == pixels(tmp_path / "whole" / "edited.exr").tobytes()
 

@@ -47,8 +47,7 @@ def sky(*suns, flux=1.5):
 
 
 def rendered(transport, image):
-    transport.resolve(image)
-    return transport.apply(mi.TensorXf(image)).numpy()
+    return transport.resolved(image).apply(mi.TensorXf(image)).numpy()
 
 
 def problem_of(transport, image, picture, coverage, prior=None):

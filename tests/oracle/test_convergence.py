@@ -12,8 +12,9 @@ import pytest
 
 from envedit.core import latlong
 from envedit.scene import camera_paths, scene
+from envedit.transport.exact_columns import Columns, ColumnStore
 from tests.oracles.plain import lookup
-from tests.oracles.scenes import ball, build, one_hot, picture, references, stage
+from tests.oracles.scenes import ball, build, picture, references, stage
 from tests.oracles.statistics import disagreement
 
 pytestmark = pytest.mark.usefixtures("own_core")
@@ -105,11 +106,11 @@ def test_error_of_a_column_falls_with_its_paths(matte):
     # one ray from every path's vertex to the texel itself.
     texel, counts = np.array([3 * WIDTH + 10]), (8, 32, 128)
     t = build(matte, spp=4)
-    image = one_hot(texel[0])
 
     def drawn(count, seed):
-        t._exact.trace(texel, count, seed)
-        return t.linear(mi.TensorXf(image)).numpy()
+        store = ColumnStore(t.scene, t.grid, t.bounces, capacity=1, seed=seed)
+        column = store.read(Columns(texel, np.array([count])))
+        return column.reshape(*t.shape, 3)
 
     exact = drawn(8192, 99).astype(np.float64)
     errors = [rmse([drawn(count, 100 + seed) for seed in range(4)], exact) for count in counts]
@@ -157,8 +158,8 @@ def test_a_stored_transport_is_off_by_its_noise_and_no_more(tmp_path):
     pictures = []
     for seed in range(count):
         build(s, spp=32, seed=seed, folder=tmp_path)
-        t = build(s, spp=32, seed=seed, folder=tmp_path)
-        assert t.cached and t.resolve(image) >= 1
+        t = build(s, spp=32, seed=seed, folder=tmp_path).resolved(image)
+        assert t.cached and len(t.columns) >= 1
         pictures.append(picture(t, image))
     pictures = np.stack(pictures).astype(np.float64)
     theirs = references(s, image, spp=1024)

@@ -296,7 +296,7 @@ def test_what_is_promised_is_seen_in_a_fresh_rendering(name, matte, rng):
     """
     lit, transport = matte
     original = sunny(20)
-    transport.resolve(original)
+    transport = transport.resolved(original)
     initial = render(transport, original)
     turned = lit.render(sunny(70), spp=256, seed=5, max_depth=3) if name == "turned" else None
     target, painted, low, high = requests(initial, turned, rng)[name]

@@ -861,7 +861,9 @@ def test_a_light_in_a_new_place_lights_the_ground_in_its_picture_too(rng):
     ground = light_places.lit_ground(problem, point)
     flux, up = np.array([3.0, 2.0, 1.0]), layers.shape[0]
     omega = latlong.lookup_solid_angles(*GRID)
-    texels, pictures = light_places.probed(problem, 4, 30, flux, spacing=2, reach=1, ground=ground)
+    texels, pictures = light_places.probed(
+        problem, point.transport, 4, 30, flux, spacing=2, reach=1, ground=ground
+    )
     of_cells = [m.numpy() for m in problem.blocks.cells(ground).of(flux)]
     size = np.bincount(problem.blocks.block_of)[:, None]
     assert len(texels) == 9

@@ -8,8 +8,10 @@ import pytest
 from envedit.core import shipped
 from envedit.core.errors import InputError
 from envedit.images.images import load_envmap
+from envedit.renderers import StoredRenderer
 from envedit.scene import scene
 from envedit.transport.block_transport import Overview
+from envedit.transport.exact_columns import Columns
 from envedit.transport.sampling_plan import COLUMN_PATHS, FEW_PATHS, FEW_TOLERANCE
 from tests.oracles.kernels import compiled
 from tests.oracles.plain import lookup
@@ -99,17 +101,17 @@ def test_pictures_are_those_of_mitsuba(recorded):
         suns = {what: SUNS[what] for what in some_suns if name == "sphere" or "last" in what}
     for what, (row, column) in suns.items():
         image = sun(row, column)
-        assert all(t.resolve(image) >= 1 for t in transports)
-        assert row * WIDTH + column in transports[0].columns
+        transports = [t.resolved(image) for t in transports]
+        assert all(row * WIDTH + column in t.columns for t in transports)
         # The plane sees a sun at the horizon at grazing incidence: both renderings are noisier.
         theirs = references(s, refined(image), spp=128)
         compare(f"sun at {what}", image, theirs, sees=1.1 if what == "the horizon" else 1.03)
         assert_transpose(transports[0], image, some)
         if name == "sphere" and what == "the seam, first column":  # negative control: one texel further
             moved = np.roll(image, 1, axis=1)
-            assert all(t.resolve(moved) >= 1 for t in transports)
-            assert disagreement(np.stack([picture(t, moved) for t in transports]), theirs) != ""
-    # The columns that are there now do not spoil other maps.
+            others = [t.resolved(moved) for t in transports]
+            assert disagreement(np.stack([picture(t, moved) for t in others]), theirs) != ""
+    # Columns do not spoil other maps.
     compare("noise through both tiers", noise(), under_noise)
     assert_transpose(transports[0], noise(), some)
     assert not wrong, wrong
@@ -122,7 +124,8 @@ def test_pictures_are_those_of_mitsuba(recorded):
 def test_pictures_under_a_real_map_are_those_of_mitsuba(recorded, data):
     _, s, transports = recorded
     image, _ = load_envmap(data / "puresky/kloofendal_48d_partly_cloudy_puresky_1k.hdr", WIDTH)
-    assert all(1 <= t.resolve(image, limit=8) <= 8 for t in transports)  # both tiers take part
+    transports = [t.resolved(image, limit=8) for t in transports]
+    assert all(1 <= len(t.columns) <= 8 for t in transports)  # both tiers take part
     ours, theirs = np.stack([picture(t, image) for t in transports]), references(s, image, spp=128)
     assert disagreement(ours, theirs) == ""
     assert disagreement(1.03 * ours, theirs) != ""  # negative control
@@ -175,8 +178,8 @@ def test_plane_under_one_texel_receives_its_irradiance():
     s = scene.load(stage(origin=(0, 5, 0), up=(0, 0, -1)))
     ours = []
     for seed in range(SEEDS):
-        t = build(s, max_depth=2, seed=seed)
-        assert t.resolve(image) == 1
+        t = build(s, max_depth=2, seed=seed).resolved(image)
+        assert len(t.columns) == 1
         ours.append(picture(t, image))
     ours = np.stack(ours)
     assert disagreement(ours, np.broadcast_to(expected, ours.shape), sizes=(4, 0)) == ""
@@ -211,9 +214,8 @@ def lit(lamp_scene):
 @pytest.fixture(scope="module")
 def resolved(lamp_scene):
     """The same with exact columns."""
-    t = build(lamp_scene, spp=32)
-    assert t.resolve(sun(4, 0)) >= 1 and t.resolve(sun(7, 9)) >= 1
-    assert t.resolve(noise(), limit=20) >= 1
+    t = build(lamp_scene, spp=32).resolved(sun(4, 0)).resolved(sun(7, 9)).resolved(noise(), limit=20)
+    assert 2 <= len(t.columns) <= 22
     return t
 
 
@@ -290,16 +292,34 @@ def test_the_light_of_other_lamps_is_the_picture_of_a_black_map(transport):
 
 def test_texels_that_deserve_it_get_columns(lamp_scene):
     t = build(lamp_scene, spp=32)
-    assert t.resolve(np.ones((HEIGHT, WIDTH, 3), np.float32)) == 0  # a grey sky has no error
+    grey = t.resolved(np.ones((HEIGHT, WIDTH, 3), np.float32))
+    assert len(grey.columns) == 0  # a grey sky has no error
     image = sun(4, 0)
     image[12, 3] = 1e6  # below the ground: bright, but of no consequence
-    assert t.resolve(image) == 1
-    np.testing.assert_array_equal(t.columns, [4 * WIDTH])
-    assert t.resolve(image) == 0  # exact for good
+    lit = t.resolved(image)
+    np.testing.assert_array_equal(lit.columns, [4 * WIDTH])
+    assert len(t.columns) == 0, "what a transport renders does not change"
+    np.testing.assert_array_equal(lit.resolved(image).columns, lit.columns)
     many = t.bright_texels(noise(), tolerance=0.001)
     radiance = noise().reshape(-1, 3).max(axis=1)[many]
     assert len(many) > len(t.bright_texels(noise(), tolerance=0.01))
     assert (np.diff(radiance) <= 0).all()  # brightest first
+
+
+def test_a_rendering_depends_on_map_and_columns_alone(lamp_scene):
+    """Not on what was rendered in between, nor on the order in which columns were asked for."""
+    pixels = lamp_scene.width * lamp_scene.height
+    base = build(lamp_scene, spp=32, memory_gb=(pixels * 32 * 1.5 * 32 + 12 * 16 * pixels) / 1e9)
+    assert base.capacity == 6
+    first, second = (base.resolved(noise(seed), tolerance=0) for seed in (0, 1))
+    before = [picture(t, noise()) for t in (base, first, second)]
+    assert (before[0] != before[1]).any() and (before[1] != before[2]).any()
+    for texel in range(2 * WIDTH, 3 * WIDTH):  # more than there is memory for
+        base.with_probed(np.array([texel])).apply(noise())
+    for t, drawn in zip((base, first, second), before, strict=True):
+        np.testing.assert_array_equal(picture(t, noise()), drawn)
+    exact = Columns(first.columns[::-1], first.exact.paths[::-1])
+    np.testing.assert_array_equal(picture(base.with_columns(exact), noise()), before[1])
 
 
 @pytest.mark.slow
@@ -312,8 +332,10 @@ def test_pictures_of_few_texels_are_those_of_the_whole_map(lamp_scene, rng, rows
     for exact in (0, 2, 30):  # coarse texels, both tiers, exact columns alone
         bright = np.ones((HEIGHT, WIDTH, 3), np.float32)
         bright[rows][np.nonzero(maps.any(axis=(0, 3)))] = 1e4
-        assert t.resolve(bright, limit=exact) <= exact
-        got = t.pictures(maps, rows)
+        before = len(t.columns)
+        t = t.resolved(bright, limit=exact)
+        assert len(t.columns) <= before + exact
+        got = t.pictures(maps, rows, most=0)
         assert got.shape == (3, *t.shape, 3) and got.dtype == np.float32 and not got[2].any()
         whole = np.zeros((3, HEIGHT, WIDTH, 3), np.float32)
         whole[:, rows] = maps
@@ -326,50 +348,47 @@ def test_pictures_of_few_texels_are_those_of_the_whole_map(lamp_scene, rng, rows
     assert not t.pictures(0 * maps, rows).any()
 
 
-def test_main_texels_of_pictures_get_columns(lamp_scene):
-    """As many as there is room for beside those that have lasted; texels with little light get none."""
-    t = build(lamp_scene, spp=32)
-    sun = np.full((HEIGHT, WIDTH, 3), 1e-3, np.float32)
-    sun[3, 9] = 1e5
-    t.resolve(sun)
-    lasting = t.columns[t._exact.paths_of[t.columns] > t.paths[0]]
-    assert len(lasting)
+def test_main_texels_of_pictures_are_rendered_by_columns(lamp_scene):
+    """By those of the fewest paths where there are no better ones; texels with little light by none."""
+    t = build(lamp_scene, spp=32).resolved(sun(3, 9))
+    better = t.columns[t.exact.paths > t.paths[0]]
+    assert len(better) == 1
     maps = np.zeros((1, HEIGHT, WIDTH, 3))
-    maps[0, 2, 4:8], maps[0, 2, 12] = -1.0, 1e-4
-    t.pictures(maps, slice(0, HEIGHT))
-    for column in range(4, 8):
-        assert 2 * WIDTH + column in t.columns
-    assert 2 * WIDTH + 12 not in t.columns and np.isin(lasting, t.columns).all()
-    maps[:] = 1.0
-    t.pictures(maps, slice(0, HEIGHT))
-    assert len(t.columns) <= t.capacity and np.isin(lasting, t.columns).all()
+    maps[0, 2, 4:8], maps[0, 3, 9], maps[0, 2, 12] = -1.0, 1.0, 1e-4
+    main = [2 * WIDTH + column for column in range(4, 8)] + [3 * WIDTH + 9]
+    assert sorted(t.main(maps, slice(0, HEIGHT))) == main
+    got = t.pictures(maps, slice(0, HEIGHT))[0]
+    whole = np.float32(maps[0])
+    by_columns = t.with_probed(np.array(main)).linear(mi.TensorXf(whole)).numpy()
+    np.testing.assert_allclose(got, by_columns, rtol=1e-4, atol=1e-6)
+    assert np.abs(got - t.linear(mi.TensorXf(whole)).numpy()).max() > 1e-3 * np.abs(got).max()
+    assert len(t.columns) == 1
+    assert len(t.main(maps, slice(0, HEIGHT), most=2)) == 2
 
 
 def test_limit_bounds_the_new_columns(lamp_scene):
     t = build(lamp_scene, spp=32)
     image = noise()
     image[4, :3] = 1e4  # lights and mere bright texels are traced differently, and bounded together
-    assert t.resolve(image, tolerance=0, limit=2) == 2
-    assert len(t.columns) == 2
+    assert len(t.resolved(image, tolerance=0, limit=2).columns) == 2
 
 
 @pytest.mark.slow
 def test_capacity_is_never_exceeded(lamp_scene):
     pixels = lamp_scene.width * lamp_scene.height
     coarse = pixels * 32 * 1.5 * 32 / 1e9
-    t = build(lamp_scene, spp=32, memory_gb=coarse + 5.5 * 16 * pixels / 1e9)
+    t = build(lamp_scene, spp=32, memory_gb=coarse + 11 * 16 * pixels / 1e9)
     assert t.capacity == 5
-    t.resolve(noise(), tolerance=0)
-    assert len(t.columns) == 5 and len(set(t.columns)) == 5
+    first = t.resolved(noise(), tolerance=0)
+    assert len(first.columns) == 5 and len(set(first.columns)) == 5
     # Texels that are bright now take the places of those that were.
-    stay = np.intersect1d(t.columns, t.bright_texels(noise(1), 0)[:5])
-    assert t.resolve(noise(1), tolerance=0) == 5 - len(stay) > 0
-    assert set(t.columns) == set(t.bright_texels(noise(1), 0)[:5])
-    fresh = build(lamp_scene, spp=32, memory_gb=coarse + 5.5 * 16 * pixels / 1e9)
-    fresh.resolve(noise(1), tolerance=0)
-    np.testing.assert_allclose(picture(t, noise()), picture(fresh, noise()), rtol=1e-5)
+    second = first.resolved(noise(1), tolerance=0)
+    assert set(second.columns) == set(t.bright_texels(noise(1), 0)[:5]) != set(first.columns)
+    fresh = t.resolved(noise(1), tolerance=0)
+    np.testing.assert_array_equal(picture(second, noise()), picture(fresh, noise()))
     none = build(lamp_scene, spp=32, memory_gb=coarse * 1.0001)
-    assert none.capacity == 0 and none.resolve(sun(4, 0)) == 0
+    assert none.capacity == 0 and not len(none.resolved(sun(4, 0)).columns)
+    assert np.isfinite(none.probe(np.array([9, 10]))).all()
     gradient = none.adjoint(mi.TensorXf(np.ones((*none.shape, 3), np.float32))).numpy()
     assert np.isfinite(picture(none, sun(4, 0))).all() and np.isfinite(gradient).all()
 
@@ -378,73 +397,65 @@ def test_capacity_is_never_exceeded(lamp_scene):
 def test_columns_of_maps_that_were_bright_lately_stay_longest(lamp_scene):
     """What is compared with a map that was rendered before keeps the columns that it was rendered with."""
     pixels = lamp_scene.width * lamp_scene.height
-    t = build(lamp_scene, spp=32, memory_gb=(pixels * 32 * 1.5 * 32 + 5.5 * 16 * pixels) / 1e9)
+    t = build(lamp_scene, spp=32, memory_gb=(pixels * 32 * 1.5 * 32 + 11 * 16 * pixels) / 1e9)
     assert t.capacity == 5
     first, second, third = (row * WIDTH + np.array([4, 5]) for row in (2, 3, 4))
     for texels in (first, second, first, third):
         image = np.full((HEIGHT * WIDTH, 3), 1e-3, np.float32)
         image[texels] = 1e4
-        t.resolve(image.reshape(HEIGHT, WIDTH, 3), tolerance=0.5)
+        t = t.resolved(image.reshape(HEIGHT, WIDTH, 3), tolerance=0.5)
     assert set(first) | set(third) <= set(t.columns)
-    t.probe(np.array([9, 10, 11]) + WIDTH * 5)
-    assert set(third) <= set(t.columns)
+    assert set(third) <= set(t.with_probed(np.array([9, 10, 11]) + WIDTH * 5).columns)
 
 
 @pytest.mark.slow
 def test_state_brings_back_the_same_bytes(lamp_scene):
-    t = build(lamp_scene, spp=32, refresh=4)
+    recorded = build(lamp_scene, spp=32)
+    renderer = StoredRenderer(recorded, refresh=4)
     image = mi.TensorXf(sun(7, 9))
     for step in (0, 5):  # the second in the next epoch: everything was traced afresh
-        drawn = t.render(image, step).numpy()
-    t.resolve(noise(), limit=5)
-    after = picture(t, noise())
-    copy = build(lamp_scene, spp=32, refresh=4)
-    copy.resolve(sun(4, 0))  # columns of its own, which go
-    copy.probe(np.arange(5 * WIDTH, 5 * WIDTH + 6))
-    copy.restore({key: np.array(value) for key, value in t.state().items()})
-    np.testing.assert_array_equal(picture(copy, noise()), after)
-    np.testing.assert_array_equal(copy.columns, t.columns)
-    np.testing.assert_array_equal(copy.render(image, 5).numpy(), t.render(image, 5).numpy())
-    assert copy.resolve(sun(4, 0)) == 1  # it is known that its column is gone
-    assert (drawn != build(lamp_scene, spp=32).render(image, 5).numpy()).any()
+        drawn = renderer.render(image, step).numpy()
+    renderer.transport = renderer.transport.resolved(noise(), limit=5)
+    after = picture(renderer.transport, noise())
+    copy = StoredRenderer(recorded.resolved(sun(4, 0)), refresh=4)  # with a column of its own, which goes
+    copy.restore({key: np.array(value) for key, value in renderer.state().items()})
+    np.testing.assert_array_equal(picture(copy.transport, noise()), after)
+    np.testing.assert_array_equal(copy.transport.columns, renderer.transport.columns)
+    np.testing.assert_array_equal(copy.render(image, 5).numpy(), renderer.render(image, 5).numpy())
+    assert (drawn != StoredRenderer(recorded).render(image, 5).numpy()).any()
 
 
 @pytest.mark.slow
 def test_refreshed_transport_is_another_estimate_of_the_same(lamp_scene):
-    t = build(lamp_scene, spp=32, refresh=1)
+    renderer = StoredRenderer(build(lamp_scene, spp=32), refresh=1)
     # Seeds far apart and many: a refreshed run visits hundreds of epochs.
-    ours = np.stack([t.render(mi.TensorXf(sun(7, 9)), step).numpy() for step in range(0, 80, 10)])
-    assert t.epoch == 70
+    ours = [renderer.render(mi.TensorXf(sun(7, 9)), step).numpy() for step in range(0, 80, 10)]
+    assert renderer.transport.epoch == 70
     theirs = references(lamp_scene, sun(7, 9))
-    assert disagreement(ours, theirs) == ""
+    assert disagreement(np.stack(ours), theirs) == ""
     assert (ours[0] != ours[1]).any()
 
 
 def test_probes_are_the_columns_that_render(lamp_scene):
     t = build(lamp_scene, spp=32)
     texels = np.array([4 * WIDTH, 7 * WIDTH + 9, 3 * WIDTH + 31, 2])
-    before = t.linear(mi.TensorXf(one_hot(texels[1]))).numpy()
-    columns = t.probe(texels)
-    assert columns.shape == (4, 17 * 23, 3) and set(t.columns) == set(texels)
-    assert (t._exact.paths_of[texels] == t.paths[0]).all()
+    columns, probed = t.probe(texels), t.with_probed(texels)
+    assert columns.shape == (4, 17 * 23, 3) and set(probed.columns) == set(texels)
+    assert (probed.exact.paths == t.paths[0]).all()
     for texel, column in zip(texels, columns, strict=True):
-        drawn = t.linear(mi.TensorXf(one_hot(texel))).numpy()
+        drawn = probed.linear(mi.TensorXf(one_hot(texel))).numpy()
         np.testing.assert_array_equal(column.reshape(drawn.shape), drawn)
         assert drawn.max() > 0
-    assert (before != t.linear(mi.TensorXf(one_hot(texels[1]))).numpy()).any()  # it was coarse
-    # What is there is not traced again, and comes in the order in which it is asked for.
-    again = t.probe(texels[::-1])
-    np.testing.assert_array_equal(again[::-1], columns)
+        assert (drawn != t.linear(mi.TensorXf(one_hot(texel))).numpy()).any()  # there it is coarse
+    np.testing.assert_array_equal(t.probe(texels[::-1])[::-1], columns)
 
 
-def test_probing_a_texel_that_has_a_better_column_keeps_it(lamp_scene):
-    t = build(lamp_scene, spp=32)
-    assert t.resolve(sun(7, 9)) == 1
+def test_probing_a_texel_that_has_a_better_column_takes_it(lamp_scene):
+    t = build(lamp_scene, spp=32).resolved(sun(7, 9))
     texels = np.array([7 * WIDTH + 9, 7 * WIDTH + 10])
     better = t.linear(mi.TensorXf(one_hot(texels[0]))).numpy()
-    columns = t.probe(texels)
-    np.testing.assert_array_equal(columns[0].reshape(better.shape), better)
-    assert t._exact.paths_of[texels].tolist() == [COLUMN_PATHS[-1], COLUMN_PATHS[0]]
+    np.testing.assert_array_equal(t.probe(texels)[0].reshape(better.shape), better)
+    assert t.with_probed(texels).exact.paths.tolist() == [COLUMN_PATHS[-1], COLUMN_PATHS[0]]
 
 
 @pytest.mark.slow
@@ -454,8 +465,7 @@ def test_few_paths_for_maps_of_few_parameters(lamp_scene, tmp_path):
     assert few.cached  # the recording is the same
     assert (few.paths, few.tolerance) == (FEW_PATHS, FEW_TOLERANCE) != (plain.paths, plain.tolerance)
     for t in (plain, few):
-        assert t.resolve(sun(7, 9)) == 1
-        assert t._exact.paths_of[t.columns].tolist() == [t.paths[-1]]
+        assert t.resolved(sun(7, 9)).exact.paths.tolist() == [t.paths[-1]]
     assert few.paths[-1] < plain.paths[-1]
     counts = [len(t.bright_texels(noise() ** 4)) for t in (plain, few)]
     assert counts[0] > counts[1]
@@ -527,8 +537,8 @@ def test_overview_on_disk_has_the_same_bits(lamp_scene, tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_another_seed_needs_no_other_kernel(lamp_scene):
     # Else every refresh, and every run of a series, would pay seconds of compilation.
-    compiled(lambda: build(lamp_scene, spp=32, seed=11).resolve(sun(7, 9)))
-    count, fresh = compiled(lambda: build(lamp_scene, spp=32, seed=12).resolve(sun(3, 20)))
+    compiled(lambda: build(lamp_scene, spp=32, seed=11).resolved(sun(7, 9)).apply(sun(7, 9)))
+    count, fresh = compiled(lambda: build(lamp_scene, spp=32, seed=12).resolved(sun(3, 20)).apply(sun(3, 20)))
     # Where no path of a batch is kept, what it left unevaluated may join a later kernel: one in a hundred.
     assert count > 50 and fresh <= 0.05 * count
 
@@ -540,7 +550,7 @@ def test_wrong_shapes_are_refused(lit):
     for shape in ((HEIGHT, WIDTH + 2, 3), (WIDTH, HEIGHT, 3), (HEIGHT, WIDTH, 4), (HEIGHT * WIDTH, 3)):
         with pytest.raises(InputError, match=r"map must have shape \(16, 32, 3\), got \("):
             lit.apply(dr.ones(mi.TensorXf, shape))
-        for takes_arrays in (lit.resolve, lit.coarse_error):
+        for takes_arrays in (lit.resolved, lit.coarse_error):
             with pytest.raises(InputError, match=r"map must have shape \(16, 32, 3\), got \("):
                 takes_arrays(np.ones(shape))
     with pytest.raises(InputError, match=r"picture must have shape \(17, 23, 3\), got \(23, 17, 3\)"):
@@ -549,7 +559,7 @@ def test_wrong_shapes_are_refused(lit):
 
 @pytest.mark.parametrize("values", [None, "sky.exr", [[1.0], [1.0, 2.0]]])
 def test_what_is_no_array_of_numbers_is_refused(lit, values):
-    for takes_maps in (lit.apply, lit.resolve, lit.coarse_error):
+    for takes_maps in (lit.apply, lit.resolved, lit.coarse_error):
         with pytest.raises(InputError, match="the map must be an array of numbers, got "):
             takes_maps(values)
     with pytest.raises(InputError, match="the picture must be an array of numbers, got "):

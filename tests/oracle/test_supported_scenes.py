@@ -53,8 +53,7 @@ def test_under_another_map_the_picture_is_mitsuba_s_with_the_scene_s_scale(tmp_p
     radiance, warnings = given_map.radiance, given_map.warnings
     expected = plain(write_scene(tmp_path, *parts, light(800, name="other.exr"), name="b.xml"))
     close(lit.render(radiance, SPP, 3), expected)
-    transport = LightTransport.build(lit, 8, 16, spp=128)
-    transport.resolve(radiance)
+    transport = LightTransport.build(lit, 8, 16, spp=128).resolved(radiance)
     close(transport.apply(mi.TensorXf(radiance)).numpy(), expected, 0.02)
     said = " ".join(inputs.notes(settings.input, lit, given_map))
     assert not warnings and "scale 800" in said and "not the scene's own" in said
@@ -116,8 +115,7 @@ def test_a_kind_of_scene_is_rendered_as_by_mitsuba_or_refused(kind, tmp_path):
     expected = expected[..., :3]
     close(lit.render(radiance, SPP, 3), expected)
     if kind.traced:
-        transport = LightTransport.build(lit, 8, 16, spp=256)
-        transport.resolve(radiance)
+        transport = LightTransport.build(lit, 8, 16, spp=256).resolved(radiance)
         close(transport.apply(mi.TensorXf(radiance)).numpy(), expected, 0.02)
 
 

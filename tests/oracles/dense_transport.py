@@ -5,6 +5,7 @@ import mitsuba as mi
 import numpy as np
 
 from envedit.transport.block_transport import Overview
+from envedit.transport.exact_columns import Columns
 from envedit.transport.sparse_matrix import ColourMatrix
 
 
@@ -22,7 +23,7 @@ class DenseTransport:
     capacity = 256
 
     def __init__(self, weights, shape, grid):
-        self.shape, self.grid, self.resolved = shape, grid, 0
+        self.shape, self.grid, self.exact = shape, grid, Columns.none()
         self.weights = np.broadcast_to(
             np.asarray(weights, np.float32), (3, shape[0] * shape[1], grid[0] * grid[1])
         )
@@ -37,10 +38,18 @@ class DenseTransport:
             row[rng.integers(0, texels, 4)] += (1 - even) / 4
         return cls(weights, shape, grid)
 
-    def resolve(self, envmap, **options):
-        """Count how often it was asked for; every texel is exact."""
-        self.resolved += 1
-        return 0
+    def resolved(self, envmap, **options):
+        """Every texel is exact."""
+        return self
+
+    def main(self, maps, rows):
+        return np.zeros(0, np.int64)
+
+    def with_probed(self, texels):
+        return self
+
+    def with_columns(self, exact):
+        return self
 
     def apply(self, envmap):
         flat = dr.reshape(mi.TensorXf(envmap), (self.grid[0] * self.grid[1], 3))

@@ -15,6 +15,7 @@ from envedit import config, representations
 from envedit.core import latlong
 from envedit.images import images
 from envedit.losses import losses, metrics, ssim
+from envedit.renderers import StoredRenderer
 from envedit.representations.layers.layers import Layers
 from envedit.scene import scene
 from envedit.solve import adam_loop, search
@@ -80,7 +81,7 @@ def transport(height: int, width: int) -> LightTransport:
     """Trace T of the scene, with exact columns where maps of the matrix have their suns."""
     traced = LightTransport.build(matte(), height, width, spp=16, max_depth=3)
     if (height, width) == (16, 32):
-        traced.probe(np.array([0 * 32 + 7, 5 * 32, 7 * 32 + 20, 5 * 32 + 9]))
+        return traced.with_probed(np.array([0 * 32 + 7, 5 * 32, 7 * 32 + 20, 5 * 32 + 9]))
     return traced
 
 
@@ -219,16 +220,13 @@ def ssim_rounding(x) -> float:
 
 
 def renderer(height, width):
-    """Trace a T; without columns, whatever cell came before."""
-    traced, first = _traced(height, width)
-    traced.restore(first)
-    return traced
+    """Return a renderer through T without columns."""
+    return StoredRenderer(_traced(height, width))
 
 
 @functools.cache
 def _traced(height, width):
-    traced = LightTransport.build(matte(), height, width, spp=16, max_depth=3, few=True)
-    return traced, {name: np.copy(value) for name, value in traced.state().items()}
+    return LightTransport.build(matte(), height, width, spp=16, max_depth=3, few=True)
 
 
 def edited(m, folder):
@@ -243,9 +241,9 @@ def edited(m, folder):
     turned = latlong.rotate(m, 90.0)
     same = np.array_equal(turned, m)
     settle(traced, m, turned)
-    wanted = traced.apply(single(turned)).numpy()
+    wanted = traced.transport.apply(single(turned)).numpy()
     if not same:
-        problem = Problem(made, traced, m, wanted)
+        problem = Problem(made, traced.transport, m, wanted)
         lights = search.search(problem, problem.state(params))
         assert np.isfinite(made.decode(problem.solution_params(lights.run.state)).numpy()).all()
     weights = config.Loss(ssim=0.1, image_l1=1.0, image_l2=1.0)
@@ -260,16 +258,16 @@ def edited(m, folder):
         assert state.history[-1]["loss"] == 0
     else:
         settle(traced, start, got)
-        after, before = (float(objective(traced.apply(single(e)), single(e), 0)[0][0]) for e in (got, start))
+        after, before = (
+            float(objective(traced.transport.apply(single(e)), single(e), 0)[0][0]) for e in (got, start)
+        )
         assert after < before
 
 
 def settle(traced, *maps):
-    """Trace the columns that maps ask for: afterwards T is the same for them at every step."""
+    """Take the columns that maps ask for: afterwards T is the same for them at every step."""
     for m in maps:
-        traced.render(single(m), 0)
-        while traced.resolve(m):
-            pass
+        traced.transport = traced.transport.resolved(m)
 
 
 # ---- metrics ---------------------------------------------------------------------------------------------

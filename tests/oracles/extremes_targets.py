@@ -8,6 +8,7 @@ import numpy as np
 from envedit import config, representations
 from envedit.core.errors import InputError, NumericalError
 from envedit.losses import display_curve, metrics, optimizer
+from envedit.renderers import StoredRenderer
 from envedit.scene import scene
 from envedit.solve import adam_loop
 from envedit.targets import painted_image
@@ -40,7 +41,7 @@ def initial():
 
 
 def traced():
-    return LightTransport.build(matte(), 16, 32, spp=16, max_depth=3)
+    return StoredRenderer(LightTransport.build(matte(), 16, 32, spp=16, max_depth=3))
 
 
 def edited(picture, weight=None, steps=STEPS, renderer=None, **more):
@@ -123,7 +124,7 @@ def _equal_in_the_loop(folder):
     made, renderer = representations.LogPixels(), traced()
     start = made.decode(made.encode(sky())).numpy()
     settle(renderer, start)
-    picture = renderer.apply(single(start)).numpy()
+    picture = renderer.transport.apply(single(start)).numpy()
     got, state = edited(picture, renderer=renderer)
     np.testing.assert_array_equal(got, start)
     assert state.history[-1]["loss"] == 0

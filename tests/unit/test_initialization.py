@@ -23,8 +23,9 @@ class Recording:
     def __init__(self, picture, spp):
         self.picture, self.spp = picture.astype(np.float32), spp
 
-    def resolve(self, envmap):
+    def resolved(self, envmap):
         assert envmap is MAP
+        return self
 
     def apply(self, envmap):
         return mi.TensorXf(self.picture)

@@ -1,5 +1,7 @@
 """By which factor the whole sky has changed, a channel at a time."""
 
+import copy
+
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -17,13 +19,15 @@ class Linear:
     def __init__(self, rng):
         weights = rng.uniform(size=(PIXELS * PIXELS, HEIGHT * WIDTH))
         self.weights = weights / weights.sum(axis=1, keepdims=True)
-        self.resolved = False
+        self.is_resolved = False
 
-    def resolve(self, envmap):
-        self.resolved = True
+    def resolved(self, envmap):
+        other = copy.copy(self)
+        other.is_resolved = True
+        return other
 
     def apply(self, envmap):
-        assert self.resolved
+        assert self.is_resolved
         return mi.TensorXf(self.exact(envmap.numpy()))
 
     def exact(self, envmap):

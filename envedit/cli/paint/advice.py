@@ -131,7 +131,7 @@ def lights(
     the map as it is, ``state`` the solution; ``listed`` are the lights of the document, of which strokes are
     taken out. The action that reaches most comes first.
     """
-    now = problem.evaluate(state, resolve=False).rendering
+    now = problem.evaluate(state).rendering
     if now is None:
         return []
     held = [stroke for stroke in document.strokes if stroke["type"] == "hold"]
@@ -174,7 +174,7 @@ def _best(problem, without, start, k, request, away=None):
     """
     lights = problem.layers.lights
     most: tuple[float, painted_places.PaintedPlace | None] = 0.0, None
-    for there in painted_places.best(problem, without, k, away):
+    for there in painted_places.best(problem, without, problem.transport, k, away):
         turn = rotation_vector(lights.centres[k], there.direction)
         size = start["size"][k] if k < lights.own else lights.log_size(there.degrees)
         placed = with_light(start, k, turn=turn, flux=there.log_flux, size=size)

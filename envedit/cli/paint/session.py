@@ -130,7 +130,8 @@ class Session:
         # ---- Light transport, and one of fewer samples while a pointer moves
         renderers.check(settings, self.scene, self.map.shape[:2])
         self._stage("tracing light transport")
-        self.transport = renderers.trace(settings, self.scene, self.map.shape[:2], self._progress)
+        traced = renderers.trace(settings, self.scene, self.map.shape[:2], self._progress)
+        self.transport = traced.resolved(self.map, limit=COLUMNS)
         self._quick = self._of_fewer_samples()
         self._recorded = self._quick is self.transport
         self._watched: Any = _Watched(self.transport, self.newer)  # a transport in all it does
@@ -139,7 +140,6 @@ class Session:
         self._stage("separating lights")
         self.placed = PlacedLights(self.map, settings.input.horizon)
         self.picking = picking.Picking(self.scene, self.placed, self.transport, self.rows)
-        self.transport.resolve(self.map, limit=COLUMNS)
         self.before = self.transport.apply(tensor(self.map)).numpy()
 
         # ---- What solves for an edit
@@ -238,8 +238,7 @@ class Session:
     def _drag(self):
         """Show the map with its lights placed, and what paint has added to it before."""
         if not self._dragged:
-            self._quick.resolve(self.solution.point.edited, limit=COLUMNS)
-            self._still_quick = self._quick.apply(tensor(self.solution.point.edited)).numpy()
+            self._render_quickly()
         self._dragged = True
         document = self.document
         placed = map_regions.changed(self.placed.place(document.lights), document.regions)
@@ -247,9 +246,14 @@ class Session:
         origin = oriented(placed, document.orientation, lights=[])
         added = self.solution.point.edited - self.solution.origin
         found = np.maximum(origin + added, 0).astype(np.float32)
-        self._quick.probe(self._quick.bright_texels(found)[: min(DRAGGED_COLUMNS, self._quick.capacity)])
-        changed = self._quick.apply(tensor(found)).numpy() - self._still_quick
+        bright = self._quick.bright_texels(found)[:DRAGGED_COLUMNS]
+        changed = self._quick.with_probed(bright).apply(tensor(found)).numpy() - self._still_quick
         self._preview = found, np.maximum(self.solution.point.rendering + changed, 0)
+
+    def _render_quickly(self):
+        """Render the solution through few samples, for what a dragged light changes."""
+        self._quick = self._quick.resolved(self.solution.point.edited, limit=COLUMNS)
+        self._still_quick = self._quick.apply(tensor(self.solution.point.edited)).numpy()
 
     def _go_on_from(self, file):
         """Take the solution that was saved of this document."""
@@ -285,7 +289,7 @@ class Session:
                 return True
             if not self._recorded:  # paths, before the first light is dragged: that takes seconds
                 self._recorded = True
-                self._quick.resolve(self.solution.point.edited, limit=COLUMNS)
+                self._render_quickly()
                 return True
             if self.solving and self.reach is None:
                 self._reach()
@@ -668,9 +672,8 @@ class Session:
 
     def _differs(self, shown, saved):
         """Say by how much the rendering of the map that was saved differs from the one that was shown."""
-        self.transport.resolve(np.maximum(shown, saved))  # the columns of one are not to displace the other's
-        before, after = (tonemap(self.transport.apply(tensor(one)).numpy()) for one in (shown, saved))
-        self.solution.refresh()
+        transport = self.transport.resolved(np.maximum(shown, saved))
+        before, after = (tonemap(transport.apply(tensor(one)).numpy()) for one in (shown, saved))
         change = np.abs(after - before)
         return (
             f"the picture differs from the one shown before by {change.mean():.2g} of a display value on "
@@ -679,7 +682,7 @@ class Session:
 
 
 class _Watched:
-    """A transport whose every call first asks whether a newer edit waits."""
+    """A transport whose every call first asks whether a newer edit waits; those that it returns do so too."""
 
     def __init__(self, transport, newer):
         self._transport, self._newer = transport, newer
@@ -688,4 +691,6 @@ class _Watched:
         found = getattr(self._transport, name)
         if callable(found) and self._newer():
             raise SupersededError
-        return found
+        if name != "resolved":
+            return found
+        return lambda *args, **options: _Watched(found(*args, **options), self._newer)

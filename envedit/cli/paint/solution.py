@@ -103,9 +103,9 @@ class Solution:
             fixed=None if locked is None else locked[self.rows.slice],
             kept=None if self.kept is None else self.kept[self.rows.slice],
         )
-        self.transport.resolve(self.origin, limit=COLUMNS)
-        self.base = self.transport.apply(tensor(self.origin)).numpy()
-        self.problem = map_problem.Problem(layers, self.transport, self.origin, self.base)
+        transport = self.transport.resolved(self.origin, limit=COLUMNS)
+        self.base = transport.apply(tensor(self.origin)).numpy()
+        self.problem = map_problem.Problem(layers, transport, self.origin, self.base)
         self.still = self.problem.state(layers.start())
         self._start_anew()
         self._painted: tuple[list, strokes.Painted] | None = None
@@ -158,7 +158,7 @@ class Solution:
         self.weight, likelihood = self.likelihood(self.hold)
         self.problem.expect(prior.of_paint(self.document.freedom, self.coverage))
         self.point = self.problem.aimed_at(self.target, likelihood, self.point)
-        self.run = gauss_newton.Run(self.run.state, self.start)
+        self.run = gauss_newton.Run(self.run.state, self.start, columns=self.run.columns)
 
     @property
     def _bare(self):
@@ -206,8 +206,7 @@ class Solution:
         found = search.search(self.problem, self.still, after_step=unless_newer)
         self.searched = True
         if found.score < now:
-            self.run, self.start = found.run, found.run.start
-        self.refresh()
+            self.run, self.start, self.point = found.run, found.run.start, found.point
         if found.others:
             self.explanations = [replace(found, run=self.run, point=self.point), *found.others]
             self.chosen = 0
@@ -228,15 +227,15 @@ class Solution:
         self.explanations[self.chosen] = replace(shown, run=self.run, point=self.point)
         other = self.explanations[index].run
         self.chosen, self.start = index, other.start
-        self.run = gauss_newton.Run(other.state, other.start)
-        self.refresh()
+        self.run = gauss_newton.Run(other.state, other.start, columns=other.columns)
+        self.point = gauss_newton.reached(self.problem, self.run)
 
     def go_on_from(self, run: gauss_newton.Run) -> None:
         """Take a solution that was saved."""
         self.run, self.start, self.searched = run, run.start, True
         if run.hold > 1:
             self.hold = run.hold
-        self.refresh()
+        self.point = gauss_newton.reached(self.problem, run)
         self._weigh()
 
     @contextlib.contextmanager
@@ -248,9 +247,4 @@ class Solution:
         try:
             yield self.problem
         finally:
-            self.refresh()
             self.point = self.problem.aimed_at(self.target, held, self.point)
-
-    def refresh(self) -> None:
-        """Evaluate the solution, whose columns of T others may have taken."""
-        self.point = self.problem.evaluate(self.run.state)

@@ -106,6 +106,20 @@ def test_a_shadow_that_was_painted_elsewhere_moves_the_sun(transport):
     assert angle(problem.direction(found.run.start, 0), DIRECTIONS[ELSEWHERE]) < 8
 
 
+def test_what_was_tried_before_changes_nothing(transport):
+    """F and an explanation are of the problem alone: columns of T that others have traced do not count."""
+    problem, start = moved(transport, ELSEWHERE)
+    point = problem.evaluate(start)
+    first = search.search(problem, start)
+    for row in range(4, 12):
+        image = sky((row, 50))
+        transport.resolved(image).apply(image)
+    np.testing.assert_array_equal(problem.evaluate(start).rendering, point.rendering)
+    again = search.search(problem, start)
+    assert (again.name, again.score) == (first.name, first.score)
+    np.testing.assert_array_equal(again.point.edited, first.point.edited)
+
+
 def test_the_new_shadow_alone_says_so_too(transport):
     """Of the old one nothing was painted: the rest may follow."""
     image, place = sky(SUN), ELSEWHERE

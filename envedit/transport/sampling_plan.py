@@ -42,7 +42,8 @@ COLUMN_TOLERANCE = 0.03
 COLUMN_PATHS = (8, 48, 320)
 """Paths a pixel of a column, by its texel's share of the picture's light (``COLUMN_SHARES``)."""
 FEW_PATHS, FEW_TOLERANCE = (16, 32, 64), 0.08
-"""Likewise and :data:`COLUMN_TOLERANCE` for maps of few parameters, which cannot follow a column's noise."""
+"""Likewise and :data:`COLUMN_TOLERANCE` for maps of few parameters, which cannot follow a column's noise
+(docs/decisions/store_of_the_transport.md)."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -94,7 +94,7 @@ class StoredRenderer:
         looks = {"looks": ("u1", self._looks.shape), "epoch": ("i8", ())}
         known = own.keys() == names and holds({name: own[name] for name in looks}, looks)
         if not (known and 0 <= own["epoch"] < 2**31):
-            raise InputError("checkpoint: it is not of this light transport; run without --resume")
+            raise InputError("the checkpoint is not of this light transport: run without --resume")
         transport = self.transport
         if int(own["epoch"]) != transport.epoch:
             transport = transport.recorded_again(int(own["epoch"]))

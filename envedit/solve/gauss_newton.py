@@ -63,11 +63,9 @@ class Run:
         both = {f"{part}.{k}": v for part in ("state", "start") for k, v in getattr(self, part).items()}
         scale = self.scale if np.isfinite(self.scale) else 0.0  # before the first step
         numbers = self.damping, scale, self.finished, self.most, self.hold
-        columns = self.columns or Columns.none()
-        return both | {
-            "numbers": np.array([*numbers, self.wide, self.corrected]),
-            "columns": np.stack([columns.texels, columns.paths]),
-        }
+        if self.columns is not None:
+            both["columns"] = np.stack([self.columns.texels, self.columns.paths])
+        return both | {"numbers": np.array([*numbers, self.wide, self.corrected])}
 
     @classmethod
     def of_arrays(cls, arrays: dict[str, np.ndarray], history: list[dict]) -> Run:
@@ -167,10 +165,10 @@ def solve(
 
 
 def reached(problem: Problem, run: Run) -> Point:
-    """Return the point where a run is, rendered as it was last."""
+    """Return the point where a run is, rendered as it was last; InputError if its columns cannot be T's."""
     if run.columns is None:
         return problem.evaluate(run.state)
-    return problem.evaluate(run.state, problem.transport.with_columns(run.columns), resolve=False)
+    return problem.evaluate(run.state, problem.transport.restored(run.columns), resolve=False)
 
 
 def descended(

@@ -136,7 +136,6 @@ class LayersSolver:
                 edit.target = edit.target.developed(edit.target.photo.of_array(arrays.pop("photo")))
             edit.target = replace(edit.target, picture=picture, compared=arrays.pop("aim"))
             run = gauss_newton.Run.of_arrays(arrays, state.history)
-            edit.renderer.transport.restored(run.columns)
         self._hold(run)
 
         # ---- Runs, one from where the last has ended

@@ -464,7 +464,7 @@ class LightTransport:
             and _within(exact.texels, 0, self.grid.texels - 1)
             and _within(exact.paths, 1, max(*COLUMN_PATHS, *FEW_PATHS))
         ):
-            raise InputError("checkpoint: its columns are not of this light transport; run without --resume")
+            raise InputError("the checkpoint is not of this light transport: run without --resume")
         return self.with_columns(Columns(exact.texels.astype(np.int64), exact.paths.astype(np.int64)))
 
     def _with_first(self, first):

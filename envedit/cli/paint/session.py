@@ -247,7 +247,8 @@ class Session:
         added = self.solution.point.edited - self.solution.origin
         found = np.maximum(origin + added, 0).astype(np.float32)
         bright = self._quick.bright_texels(found)[:DRAGGED_COLUMNS]
-        changed = self._quick.with_probed(bright).apply(tensor(found)).numpy() - self._still_quick
+        self._dragging = self._quick.with_probed(bright)
+        changed = self._dragging.apply(tensor(found)).numpy() - self._still_quick
         self._preview = found, np.maximum(self.solution.point.rendering + changed, 0)
 
     def _render_quickly(self):
@@ -258,11 +259,9 @@ class Session:
     def _go_on_from(self, file):
         """Take the solution that was saved of this document."""
         try:
-            run = checkpoint.load_solution(Path(file), self.solution.still)
+            self.solution.go_on_from(checkpoint.load_solution(Path(file), self.solution.still))
         except InputError as error:
             self.notes = [*self.notes, str(error)]
-        else:
-            self.solution.go_on_from(run)
 
     # ---- what goes on --------------------------------------------------------------------------------------
 
@@ -475,7 +474,7 @@ class Session:
         shown = self._adjusted(edited)
         rendering = self._preview[1] if self._dragged else self.solution.point.rendering
         if shown is not edited:
-            by = self._quick if self._dragged else self.transport
+            by = self._dragging if self._dragged else self.solution.point.transport
             rendering = by.apply(tensor(shown)).numpy()
         if rendering is not self._shown:  # a stroke that is being drawn has changed nothing yet
             self._shown = rendering

@@ -232,10 +232,10 @@ class Solution:
 
     def go_on_from(self, run: gauss_newton.Run) -> None:
         """Take a solution that was saved."""
+        self.point = gauss_newton.reached(self.problem, run)
         self.run, self.start, self.searched = run, run.start, True
         if run.hold > 1:
             self.hold = run.hold
-        self.point = gauss_newton.reached(self.problem, run)
         self._weigh()
 
     @contextlib.contextmanager

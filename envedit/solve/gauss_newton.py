@@ -56,7 +56,7 @@ class Run:
 
     def onward(self, **changes: Any) -> Run:
         """Return another run, with the defaults but for changes, that goes on from where this one is."""
-        return Run(self.state, self.start, history=self.history, columns=self.columns, **changes)
+        return Run(self.state, self.start, history=list(self.history), columns=self.columns, **changes)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return all but the history as arrays, for a checkpoint."""

@@ -150,7 +150,7 @@ class LayersSolver:
                     break
                 run = following
         self.posterior = solution.posterior
-        edit.renderer.transport = edit.problem().transport.with_columns(solution.run.columns)
+        edit.renderer.transport = edit.renderer.transport.with_columns(solution.run.columns)
         self.note = "; ".join(self._notes(solution))
         history = solution.run.history
         return solution.params, adam_loop.State(step=len(history), history=history)
@@ -245,7 +245,7 @@ class LayersSolver:
         for curve in photo.curves:
             edit.target = before.developed(before.photo.under(curve, rendering, before.weight))
             problem = edit.problem()
-            one = replace(run.onward(), history=list(run.history))
+            one = run.onward()
             point = gauss_newton.reached(problem, one)
             if point.residual is None:
                 continue

@@ -1,6 +1,8 @@
 """``python -m envedit.doctor``; see :mod:`envedit.cli.doctor`."""
 
-from envedit.cli.doctor import main
+import sys
+
+from envedit.cli.main import main
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(main(["doctor", *sys.argv[1:]]))

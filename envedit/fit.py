@@ -1,6 +1,8 @@
 """``python -m envedit.fit MAP.exr``; see :mod:`envedit.cli.fit`."""
 
-from envedit.cli.fit import main
+import sys
+
+from envedit.cli.main import main
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(main(["fit", *sys.argv[1:]]))

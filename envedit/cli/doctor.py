@@ -26,7 +26,6 @@ from types import ModuleType
 from typing import Any
 
 from envedit.cli.console import make_parser
-from envedit.cli.streams import steady
 from envedit.core import interrupts, machine
 from envedit.core.atomic_files import opened, write_atomically
 from envedit.core.errors import InputError, MachineError
@@ -305,7 +304,6 @@ def matmul_rate(size: int, repeats: int) -> float:
 # ---- The command line --------------------------------------------------------------------------------------
 
 
-@steady
 def main(arguments: list[str] | None = None) -> int:
     """Print the versions and the outcome of the self test; return the exit code, 0 or 4."""
     about = "Check whether this machine can run envedit: exit code 0, or 4 and what to do."

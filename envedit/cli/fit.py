@@ -9,7 +9,6 @@ import mitsuba as mi
 from envedit import config, inputs
 from envedit.cli import doctor
 from envedit.cli.console import Console, add_overrides, exit_code, make_parser
-from envedit.cli.streams import steady
 from envedit.config import presets
 from envedit.core.array_cache import cache_folder
 from envedit.core.atomic_files import write_atomically
@@ -19,7 +18,6 @@ from envedit.report import manifest, output_folder, preview
 from envedit.representations.siren import fit
 
 
-@steady
 def main(argv: list[str] | None = None) -> int:
     """Fit a map, write what the network makes of it, and say how good it is; returns the exit code."""
     parser = make_parser(

@@ -29,7 +29,7 @@ COMMANDS = {
 }
 
 
-@steady
+@steady()
 def main(argv: list[str] | None = None) -> int:
     """Run a command; returns the exit code."""
     arguments = sys.argv[1:] if argv is None else argv

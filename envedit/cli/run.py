@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING
 
 from envedit.cli import doctor, run_options
 from envedit.cli.console import Console, exit_code
-from envedit.cli.streams import steady
 from envedit.core import shipped
 from envedit.core.errors import ConfigError, InputError
 
@@ -25,7 +24,6 @@ if TYPE_CHECKING:
     from envedit import config
 
 
-@steady
 def main(argv: list[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     begun = time.perf_counter()
@@ -166,12 +164,13 @@ def _edit(settings, base, budget, resume, console, begun):
 def _write(result, folder, import_s, console, notes):
     """Write the results of an edit, and say what they are."""
     from envedit.report import run_folder
+    from envedit.report.verdict import verdict
 
     for line in run_folder.write(folder, result, import_s):
         console.warn(line)
     for line in notes:
         console.say(line)
-    console.say(_verdict(result.metrics))
+    console.say(verdict(result.metrics))
     console.say(f"results in {folder.resolve()}")
     _note_results(console, folder)
 
@@ -295,35 +294,3 @@ def _note_results(console, folder):
     files = {name: str((folder / name).resolve()) for name in names if (folder / name).is_file()}
     metrics = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
     console.facts |= {"folder": str(folder.resolve()), "files": files, "metrics": metrics}
-
-
-def _verdict(measured):
-    """Return the last line of a run: how near its rendering came to the target."""
-    from envedit.losses import metrics
-
-    painted = measured["painted"]
-    if painted:
-        line = metrics.painted_verdict(painted)
-    elif not (measured["iterations"] or measured["envmap"] or measured["initial"]["log_rmse"]):
-        measure = "log RMSE" if metrics.saturated([measured["render"]]) else "PSNR"
-        score = metrics.score(measured["render"], [])
-        line = f"no target; {measure} of the rendering against the initial one {score}"
-    else:
-        line = f"rendering {_change(measured['initial'], measured['render'])}"
-        if measured["envmap"]:
-            line += f", map {_change(measured['initial_envmap'], measured['envmap'])}"
-        if measured["ceiling"]:
-            line += f", noise alone leaves {metrics.score(measured['ceiling'], [measured['render']])}"
-    if camera := measured["camera"]:
-        line += f"; {camera['summary']}"
-    return line + f", {measured['timing']['total_s']:.1f} s"
-
-
-def _change(before, after):
-    """Return two scores, "20.1 -> 35.2 dB", and whether most of the difference is beyond their measure."""
-    from envedit.losses import metrics
-
-    pair = before, after
-    first, last = (metrics.score(one, pair) for one in pair)
-    saturated = " (most of the difference is outside the display's range)" if metrics.saturated(pair) else ""
-    return f"{first.rpartition(' ')[0]} -> {last}{saturated}"

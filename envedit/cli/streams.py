@@ -7,11 +7,10 @@ it went, whether or not anybody could read along.
 from __future__ import annotations
 
 import contextlib
-import functools
 import io
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Iterator
 
 
 class _Steady:
@@ -40,26 +39,20 @@ class _Steady:
         return getattr(self._stream, name)
 
 
-def steady(main: Callable[..., int]) -> Callable[..., int]:
-    """Let a command line's ``main`` run with streams that do not fail; letters they lack are escaped."""
-
-    @functools.wraps(main)
-    def run(*arguments, **keys):
-        if isinstance(sys.stdout, _Steady):
-            return main(*arguments, **keys)
-        for name in ("stdin", "stdout", "stderr"):
-            if getattr(sys, name) is None:  # closed; a file of results would get its descriptor
-                setattr(sys, name, open(os.devnull, "r+"))  # noqa: SIM115 (until the process ends)
-        streams = sys.stdout, sys.stderr
-        for stream in streams:
-            if isinstance(stream, io.TextIOWrapper):
-                stream.reconfigure(errors="backslashreplace")
-        sys.stdout, sys.stderr = (_Steady(stream) for stream in streams)
-        try:
-            return main(*arguments, **keys)
-        finally:
-            sys.stdout.flush()
-            sys.stderr.flush()
-            sys.stdout, sys.stderr = streams
-
-    return run
+@contextlib.contextmanager
+def steady() -> Iterator[None]:
+    """Let a command line run with streams that do not fail; letters they lack are escaped."""
+    for name in ("stdin", "stdout", "stderr"):
+        if getattr(sys, name) is None:  # closed; a file of results would get its descriptor
+            setattr(sys, name, open(os.devnull, "r+"))  # noqa: SIM115 (until the process ends)
+    streams = sys.stdout, sys.stderr
+    for stream in streams:
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+    sys.stdout, sys.stderr = (_Steady(stream) for stream in streams)
+    try:
+        yield
+    finally:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        sys.stdout, sys.stderr = streams

@@ -24,7 +24,6 @@ p, ul { margin: .4rem 0; }
 ul { padding-left: 1.2rem; }
 .soft, figcaption, .ends, .unknown { color: var(--soft); font-size: .87rem; }
 .verdict { font-size: 1.1rem; }
-.alarm { color: var(--alarm); }
 .warnings { border-left: 3px solid var(--alarm); background: #fff; margin: 1.2rem 0; padding: .6rem 1rem; }
 .grid { display: grid; gap: 1rem; align-items: end; }
 figure { margin: 0; }

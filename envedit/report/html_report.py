@@ -17,11 +17,11 @@ from envedit.core.atomic_files import write_atomically
 from envedit.core.color import luminance
 from envedit.core.latlong import solid_angles
 from envedit.core.types import FilePath
-from envedit.losses.metrics import painted_verdict, saturated, score, worse
 from envedit.report import html_parts as parts
 from envedit.report import preview
 from envedit.report.curves import curves_svg, escape, normalised
 from envedit.report.manifest import plain
+from envedit.report.verdict import verdict
 
 if TYPE_CHECKING:
     from envedit.results import Result
@@ -118,7 +118,7 @@ def write_report(path: FilePath, result: Result, manifest: dict) -> None:
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">',
         '<meta name="viewport" content="width=device-width, initial-scale=1">',
         f"<title>{title}</title><style>{parts.STYLE}</style></head><body>",
-        f"<h1>{title}</h1>{_verdict(metrics)}",
+        f'<h1>{title}</h1><p class="verdict">{escape(verdict(metrics))}</p>',
         f'<div class="warnings"><strong>Warnings</strong>{parts.listing(warnings)}</div>' if warnings else "",
         _pictures(names, by_view, maps, tonemap),
         _section("Differences", _differences(by_view, maps, tonemap), 2),
@@ -272,41 +272,6 @@ def _losses(history, settings):
     if not curves:
         return f'<p class="soft">No loss to draw in {len(history)} rows of history.</p>'
     return curves + (f'<p class="soft">{escape(about)}</p>' if about else "")
-
-
-# ----------------------------------------------------------------------------------------------------------
-# Text
-
-
-def _verdict(metrics):
-    """Say in one line how good the result is, and under it, in red, if it is worse than none."""
-    before = metrics["initial"]
-    after = metrics["render"]
-    rendered = before, after
-    painted = metrics["painted"]
-    alarm = ""
-
-    # ---- The rendering, or of a painted target the share of the paint
-    if painted is None:
-        kind = "log RMSE: a display shows little of what differs" if saturated(rendered) else "PSNR"
-        verdict = f"Rendering against the target: {score(before, rendered)} → "
-        verdict += f"<strong>{score(after, rendered)}</strong> {kind}"
-        if metrics["ceiling"]:
-            verdict += f" (noise alone: {score(metrics['ceiling'], rendered)})"
-        if worse(after, before):
-            alarm = "further from the target than the unedited one"
-    else:
-        verdict = painted_verdict(painted)
-        if painted["towards"] is not None and painted["towards"] < 0:
-            alarm = "further from the paint than the unedited one"
-
-    # ---- The map, and the time
-    if metrics["envmap"]:
-        maps = f"{score(metrics['initial_envmap'], [])} → {score(metrics['envmap'], [])}"
-        verdict += f" · map against the true one: {maps}"
-    verdict += f" · {metrics['timing']['total_s']:.1f} s in total"
-    line = f'<p class="verdict">{verdict}</p>'
-    return line + (f'<p class="alarm">The edited rendering is {alarm}.</p>' if alarm else "")
 
 
 # ----------------------------------------------------------------------------------------------------------

@@ -47,7 +47,7 @@ class Page(HTMLParser):
 
 SCORES = {"ssim": 0.98, "mse": 1e-4, "lpips": None, "log_rmse": 0.2, "beyond_display": 0.0}
 METRICS = {"render": {"psnr": 38.71, **SCORES}, "initial": {"psnr": 19.2, **SCORES}}
-METRICS |= dict.fromkeys(("ceiling", "envmap", "painted"))
+METRICS |= dict.fromkeys(("ceiling", "envmap", "painted", "camera"))
 METRICS |= {
     "fit": {"log_psnr": 45.7, "peak_ratio": 0.88, "epochs": 400, "cached": False},
     "timing": {"edit_s": 21.4, "total_s": 47.3, "report_s": None, "per_iteration_ms": 53.5},
@@ -72,13 +72,13 @@ def write(path, settings=None, manifest=None, metrics=None, **changes):
 def test_report_is_one_file_that_says_the_verdict(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     page = write(tmp_path / "report.html")
-    assert "19.2 dB → 38.7 dB PSNR · 47.3 s in total" in page.text
-    assert "map against the true one" not in page.text and "target, environment map: not known" in page.text
+    assert "rendering 19.2 -> 38.7 dB, 47.3 s" in page.text
+    assert "target, environment map: not known" in page.text
     assert page.tags.count("img") == 5 + 2
     assert all(link.startswith("data:image/png;base64,") for link in page.links)
     assert not {"script", "link", "iframe"} & set(page.tags)
     assert "http" not in (tmp_path / "report.html").read_text()
-    assert "further from the target" not in page.text and "Warnings" not in page.text
+    assert "Warnings" not in page.text
     assert "−0.1 0 +0.1" in page.text, "0.66 - 0.73, rounded up"
     assert "+1 stops" in page.text
 
@@ -112,17 +112,13 @@ def test_report_shows_what_the_view_determines(tmp_path):
 
 
 def test_report_of_paint_says_how_far_it_was_followed(tmp_path):
-    psnr = {"initial": {"psnr": 30.0, **SCORES}, "render": {"psnr": 25.0, **SCORES}}
     painted = {"towards": 0.81, "elsewhere": 0.0123, "reachable": 0.9}
     reach = Reach(share=0.9, picture=grey(0.5), residual=grey(0.1), envmap=grey(1.0))
-    page = write(tmp_path / "r.html", metrics=psnr | {"painted": painted}, reach=reach)
+    page = write(tmp_path / "r.html", metrics={"painted": painted}, reach=reach)
     assert "81 % of the painted change reached (90 % feasible), mean change elsewhere 0.012" in page.text
     assert "What was painted" in page.text and "90 % of the painted change is feasible" in page.text
-    assert "further from" not in page.text  # the whole picture may well be
-    worse = write(tmp_path / "w.html", metrics={"painted": painted | {"towards": -0.2}})
-    assert "further from the paint" in worse.text
-    faint = write(tmp_path / "f.html", metrics=psnr | {"painted": painted | {"towards": None}})
-    assert "painted change is below the noise" in faint.text and "further from" not in faint.text
+    faint = write(tmp_path / "f.html", metrics={"painted": painted | {"towards": None}})
+    assert "painted change is below the noise" in faint.text
 
 
 def test_report_of_a_known_map_and_a_failed_edit(tmp_path):
@@ -132,9 +128,9 @@ def test_report_of_a_known_map_and_a_failed_edit(tmp_path):
     metrics = {name: {"psnr": psnr, **SCORES} for name, psnr in scores.items()}
     maps = {"initial": grey(1.0), "target": truth, "edited": grey(1.0)}
     page = write(tmp_path / "r.html", metrics=metrics, maps=maps)
-    assert "map against the true one: 9.9 dB → 12.3 dB" in page.text
+    assert "rendering 20.0 -> 15.0 dB, map 9.9 -> 12.3 dB, 47.3 s" in page.text
     assert "unedited map edited map PSNR (dB) 20 15 9.87 12.34" in page.text
-    assert "further from the target" in page.text and "target 16 × 8 1e+06 3, 5" in page.text
+    assert "target 16 × 8 1e+06 3, 5" in page.text
 
 
 def test_report_escapes_all_text(tmp_path):

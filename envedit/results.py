@@ -52,38 +52,20 @@ class Result:
         Name of each view, and its rows in a rendering.
     lights : dict
         Lights ``before`` and ``after``, of :func:`.light_list.matched`.
-    core : ndarray (H, W, 3) float32
-        The lights alone in the edited map, radiance that reaches the scene.
     settings : config.Config
         What was carried out.
-    to_world : ndarray (3, 3), optional
-        Rotation from the map's frame to the scene's; None: none.
     influence : ndarray (H, W), optional
         T' 1, how much each texel adds to the picture; None where the renderer does not know.
     frozen : ndarray of bool (H, W), optional
         Active texels that were kept, as this view does not determine them; None as above.
-    scene : Path, optional
-        The scene's file.
     reach : feasibility.Reach, optional
         How much of a painted request any light can do; None where T is not at hand or nothing was painted.
     posterior : map_problem.Posterior, optional
         How well the target determines the sky; None where that is not known.
-    given : inputs.InputMap, optional
-        The map that was edited.
-    alpha : ndarray (h, w), optional
-        Share of each pixel that sees a surface, where the scene hides what lights it.
-    found : file_resolution.Found, optional
-        What the map was decoded from, for :func:`.file_resolution.at_full_resolution`.
     photo : photo.Photo, optional
         The photograph that was the target, with its camera.
-    outliers : ndarray of bool (h, w), optional
-        Its pixels that the light does not explain.
     variants : list of Variant
         Other explanations of paint, likeliest first.
-    memory : inputs.Given, optional
-        What was given as an array or object and not as a file.
-    base : Path, optional
-        Folder that file names in scene parameters are relative to.
     """
 
     envmap: np.ndarray
@@ -95,22 +77,22 @@ class Result:
     warnings: list[str]
     views: tuple[View, ...]
     lights: dict[str, list[dict]]
-    core: np.ndarray
+    core: np.ndarray  # (H, W, 3), the lights alone in the edited map, radiance that reaches the scene
     settings: config.Config
-    to_world: np.ndarray | None = None
+    to_world: np.ndarray | None = None  # (3, 3), from the map's frame to the scene's
     influence: np.ndarray | None = None
     frozen: np.ndarray | None = None
-    scene: Path | None = None
+    scene: Path | None = None  # its file
     reach: Reach | None = None
-    given: inputs.InputMap | None = None
-    alpha: np.ndarray | None = None
-    found: file_resolution.Found | None = None
+    given: inputs.InputMap | None = None  # the map that was edited
+    alpha: np.ndarray | None = None  # (h, w), share of a pixel that sees a surface, where the sky is hidden
+    found: file_resolution.Found | None = None  # what the map was decoded from
     posterior: Posterior | None = None
     photo: Photo | None = None
-    outliers: np.ndarray | None = None
+    outliers: np.ndarray | None = None  # bool (h, w), pixels of the photograph that light does not explain
     variants: list[Variant] = field(default_factory=list)
-    memory: inputs.Given | None = None
-    base: Path | None = None
+    memory: inputs.Given | None = None  # what was given as an array or object and not as a file
+    base: Path | None = None  # what file names in scene parameters are relative to
 
     @property
     def separation(self) -> Separation | None:

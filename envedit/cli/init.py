@@ -10,7 +10,6 @@ from envedit.cli.console import Console, exit_code, make_parser
 from envedit.core import shipped
 from envedit.core.errors import ConfigError, InputError
 
-# Lines of "setting  # comment"; the comments are aligned when the settings are known.
 TEMPLATE = """\
 # envedit run {name}
 # All keys with their meaning: envedit schema --markdown. Paths are relative to this file.
@@ -39,8 +38,6 @@ rotate_degrees = 60.0  # the same one, turned about the vertical; or file = "ano
 [representation]
 kind = "layers"  # or "siren", the paper's; "pixels"; "log-pixels"
 """
-WIDEST = 48
-"""A setting that is wider than this, as with a long path, is not counted when comments are aligned."""
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -90,7 +87,6 @@ def _write(arguments):
         scene=config.quote(scene),
         shipped=", ".join(shipped.scenes()),
     )
-    text = _aligned(text)
     config.loads(text, file.absolute().parent, str(file))
     write_atomically(file, text.encode())
     print(f"{arguments.out}: written; edit it, then: envedit run {shlex.quote(arguments.out)}")
@@ -109,13 +105,3 @@ def _file_name(option, value, names, kind, folder):
             f"{option}: got {value}: no such file; expected {kind}, or {', '.join(names)}; {hint}"
         )
     return os.path.relpath(value, folder)
-
-
-def _aligned(text):
-    """Put the comments of all settings into one column."""
-    lines = [line.partition("  # ") for line in text.splitlines()]
-    width = max(len(setting) for setting, mark, _ in lines if mark and len(setting) <= WIDEST)
-    return "".join(
-        f"{setting:{width}}{mark}{comment}".rstrip() + "\n" if mark else f"{setting}\n"
-        for setting, mark, comment in lines
-    )

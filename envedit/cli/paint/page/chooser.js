@@ -1,6 +1,6 @@
 // The start page: maps to choose, and scenes, examples and earlier paintings to open, with small pictures.
 
-const $ = (id) => document.getElementById(id);
+import { $ } from "./elements.js";
 
 export class Chooser {
   constructor(map, open) {
@@ -54,6 +54,6 @@ export class Chooser {
 
   // The tile of the map that is written in the field is the chosen one.
   mark() {
-    for (const button of $("maps").querySelectorAll("button")) button.setAttribute("aria-pressed", String(button.dataset.value === this.map.value.trim()));
+    for (const button of $("maps").querySelectorAll("button")) button.ariaPressed = String(button.dataset.value === this.map.value.trim());
   }
 }

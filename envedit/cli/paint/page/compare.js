@@ -1,9 +1,9 @@
 // What is compared: the rendering with the original or with a state A, the map large with the original, all steps.
 
 import { Display } from "./display.js";
+import { $, button } from "./elements.js";
 import { Zoom } from "./zoom.js";
 
-const $ = (id) => document.getElementById(id);
 const SHOWN_STEPS = 60;
 const THUMB = 48; // pixels high
 const NAMES = { strokes: "strokes", lights: "lights", regions: "regions of the map", rotate_degrees: "turn of the sky", tilt_degrees: "tilt", horizon_degrees: "horizon", exposure: "map exposure", temperature: "map temperature", rest: "the rest", freedom: "the sky may change" };
@@ -79,7 +79,7 @@ export class Compare {
   toggle() {
     const open = $("steps").hidden;
     $("steps").hidden = !open;
-    $("past").setAttribute("aria-expanded", String(open));
+    $("past").ariaExpanded = String(open);
     this.draw();
   }
 
@@ -101,20 +101,16 @@ export class Compare {
       this.drawn = shown;
     }
     shown.forEach((step, k) => {
-      const button = $("steps").children[k];
-      button.setAttribute("aria-pressed", String(first + k === at));
-      button.replaceChildren(this.thumbs.get(step) ?? String(first + k));
+      const shownStep = $("steps").children[k];
+      shownStep.ariaPressed = String(first + k === at);
+      shownStep.replaceChildren(this.thumbs.get(step) ?? String(first + k));
     });
     $("steps").children[at - first]?.scrollIntoView({ block: "nearest", inline: "nearest" });
   }
 
   button(step, i) {
-    const button = document.createElement("button");
-    button.dataset.testid = `step-${i}`;
-    button.title = i ? changed(this.history.steps[i - 1], step) : "the beginning";
-    button.setAttribute("aria-label", `Step ${i}: ${button.title}`);
-    button.addEventListener("click", () => this.history.go(i));
-    return button;
+    const title = i ? changed(this.history.steps[i - 1], step) : "the beginning";
+    return button(`step-${i}`, "", { title, ariaLabel: `Step ${i}: ${title}` }, () => this.history.go(i));
   }
 }
 

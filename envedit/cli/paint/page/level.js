@@ -1,5 +1,6 @@
 // The level of the map: its equator as a line, with a grip in the middle (horizon) and one at the right (tilt).
 
+import { ARROWS, clamp, consume, follow } from "./elements.js";
 import { seen } from "./orientation.js";
 
 const GRIPS = { // which degrees it changes, which way upwards is, and where on the equator of the file it is
@@ -22,41 +23,34 @@ export class Level {
 
   toggle() {
     this.holder.hidden = !this.holder.hidden;
-    this.button.setAttribute("aria-pressed", String(!this.holder.hidden));
+    this.button.ariaPressed = String(!this.holder.hidden);
     this.draw();
   }
 
   // What a grip changes, moved upwards by degrees from where it was.
   moved(name, before, degrees) {
     const { key, up, most } = GRIPS[name];
-    return { [key]: Math.round(100 * Math.max(-most, Math.min(most, before + up * degrees))) / 100 };
+    return { [key]: Math.round(100 * clamp(before + up * degrees, -most, most)) / 100 };
   }
 
   drag(event, name) {
     if (event.button !== 0) return;
-    event.preventDefault();
-    event.stopPropagation();
+    consume(event);
     const grip = this.grips[name], start = event.clientY, height = this.stack.getBoundingClientRect().height;
     const before = this.on.document()[GRIPS[name].key];
     let change = null;
     grip.focus();
-    grip.setPointerCapture(event.pointerId);
-    grip.onpointermove = (e) => {
+    follow(grip, event, (e) => {
       change = this.moved(name, before, ((start - e.clientY) / height) * 180);
       this.on.preview(change);
-    };
-    grip.onpointerup = grip.onpointercancel = () => {
-      grip.onpointermove = grip.onpointerup = grip.onpointercancel = null;
-      if (change) this.on.done(change);
-    };
+    }, () => { if (change) this.on.done(change); });
   }
 
   key(event, name) {
-    const way = { ArrowUp: 1, ArrowRight: 1, ArrowDown: -1, ArrowLeft: -1 }[event.key];
-    if (!way) return;
-    event.preventDefault();
-    event.stopPropagation();
-    this.on.done(this.moved(name, this.on.document()[GRIPS[name].key], way * (event.shiftKey ? LARGE_STEP : STEP)));
+    const move = ARROWS[event.key];
+    if (!move) return;
+    consume(event);
+    this.on.done(this.moved(name, this.on.document()[GRIPS[name].key], (move[0] + move[1]) * (event.shiftKey ? LARGE_STEP : STEP)));
   }
 
   draw(document = this.on.document()) {
@@ -68,8 +62,7 @@ export class Level {
       const grip = this.grips[name], at = seen(document, { azimuth, elevation: 0 }), degrees = document[key];
       grip.style.left = `${at.azimuth / 3.6}%`;
       grip.style.top = `${(90 - at.elevation) / 1.8}%`;
-      grip.setAttribute("aria-valuenow", degrees);
-      grip.setAttribute("aria-valuetext", `${degrees} degrees`);
+      Object.assign(grip, { ariaValueNow: degrees, ariaValueText: `${degrees} degrees` });
     }
   }
 }

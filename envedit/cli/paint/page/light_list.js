@@ -1,5 +1,6 @@
 // All lights in a table: name, role, flux in stops, radius in degrees, kelvin; solo, mute, lock. A click chooses one.
 
+import { button } from "./elements.js";
 import { degrees, flux, luminance, off, signed, stops } from "./lights.js";
 
 const COLUMNS = ["", "Name", "Role", "Stops", "Radius °", "Kelvin", ""];
@@ -25,18 +26,15 @@ export class LightList {
   }
 
   row(i) {
-    const button = (name, text, title, act) => {
-      const made = Object.assign(document.createElement("button"), { textContent: text, title });
+    const cell = (name, text, title, act) => button(`list-${name}-${i + 1}`, text, { title, ariaLabel: `${name} light ${i + 1}` }, act);
+    const control = (name, made, attributes) => {
+      Object.assign(made, { ariaLabel: `${name} of light ${i + 1}`, ...attributes });
       made.dataset.testid = `list-${name}-${i + 1}`;
-      made.setAttribute("aria-label", `${name} light ${i + 1}`);
-      made.addEventListener("click", act);
+      made.addEventListener("focus", () => this.lights.choose(i));
       return made;
     };
     const input = (name, attributes, change) => {
-      const made = Object.assign(document.createElement("input"), attributes);
-      made.dataset.testid = `list-${name}-${i + 1}`;
-      made.setAttribute("aria-label", `${name} of light ${i + 1}`);
-      made.addEventListener("focus", () => this.lights.choose(i));
+      const made = control(name, document.createElement("input"), attributes);
       made.addEventListener("change", () => {
         const light = this.lights.list()[i], usable = made.checkValidity() && (made.type === "text" || made.value !== "");
         if (usable) this.lights.edit(i, change(light, made.value));
@@ -44,18 +42,15 @@ export class LightList {
       });
       return made;
     };
-    const chosen = button("choose", i + 1, "Choose its handle on the map", () => this.lights.choose(i));
-    const role = document.createElement("select");
+    const chosen = cell("choose", i + 1, "Choose its handle on the map", () => this.lights.choose(i));
+    const role = control("role", document.createElement("select"), {});
     role.append(...ROLES.map((value) => new Option(value || "–", value)));
-    role.dataset.testid = `list-role-${i + 1}`;
-    role.setAttribute("aria-label", `role of light ${i + 1}`);
-    role.addEventListener("focus", () => this.lights.choose(i));
     role.addEventListener("change", () => this.lights.edit(i, { role: role.value || undefined }));
     const name = input("name", { type: "text", maxLength: 60 }, (_, value) => ({ name: value.trim() || undefined }));
     const stop = input("stops", { type: "number", min: -20, max: 20, step: 0.1 }, (light, value) => ({ flux: limited(light.entry.flux.map((v) => v * 2 ** (value - stops(light, this.lights.unit)))) }));
     const size = input("radius", { type: "number", min: 0.01, max: 90, step: "any" }, (light, value) => ({ size: Math.max(0.01, light.own ? Math.min(20, value / light.own.radius) : Number(value)) }));
     const kelvin = input("kelvin", { type: "number", min: 2000, max: 25000, step: "any" }, (light, value) => this.coloured(light, Number(value)));
-    const switches = Object.fromEntries(SWITCHES.map(([key, text, title]) => [key, button(key, text, title, () => this.press(key, i))]));
+    const switches = Object.fromEntries(SWITCHES.map(([key, text, title]) => [key, cell(key, text, title, () => this.press(key, i))]));
     const group = document.createElement("span");
     group.append(...Object.values(switches));
     return { cells: [chosen, name, role, stop, size, kelvin, group], chosen, name, role, stop, size, kelvin, switches };
@@ -74,16 +69,16 @@ export class LightList {
       input.defaultValue = text;
     };
     const value = stops(light, this.lights.unit), kelvin = this.kelvin(flux(light));
-    row.chosen.setAttribute("aria-pressed", String(i === this.lights.chosen));
+    row.chosen.ariaPressed = String(i === this.lights.chosen);
     write(row.name, light.entry.name ?? "");
     row.name.placeholder = light.own ? `light ${i + 1}` : "added";
     row.role.value = light.entry.role ?? "";
     write(row.stop, Number.isFinite(value) ? signed(value).replace("−", "-").replace("+", "") : "");
     write(row.size, String(+degrees(light).toPrecision(3)));
     write(row.kelvin, kelvin ? String(Math.round(kelvin / 10) * 10) : "");
-    row.switches.solo.setAttribute("aria-pressed", String(i === this.lights.solo));
-    row.switches.mute.setAttribute("aria-pressed", String(Boolean(off(light))));
-    row.switches.lock.setAttribute("aria-pressed", String(Boolean(light.entry.locked)));
+    row.switches.solo.ariaPressed = String(i === this.lights.solo);
+    row.switches.mute.ariaPressed = String(Boolean(off(light)));
+    row.switches.lock.ariaPressed = String(Boolean(light.entry.locked));
   }
 
   // The flux of a light in the colour of a black body, at the same luminance.

@@ -1,6 +1,7 @@
 // The lights of the map as handles, and the panel of the one that is chosen.
 // Entries are as in [[input.lights]]: with `light` one of the map's own, with factors; without it an added one.
 
+import { ARROWS, button, clamp, consume, follow } from "./elements.js";
 import { seen, unseen } from "./orientation.js";
 
 export class Lights {
@@ -77,43 +78,37 @@ export class Lights {
   // Move a light by degrees on the map as it is seen.
   moveBy(index, light, dx, dy) {
     const document = this.on.document(), { azimuth, elevation } = seen(document, light);
-    const there = unseen(document, { azimuth: azimuth + dx, elevation: Math.max(-90, Math.min(90, elevation + dy)) });
+    const there = unseen(document, { azimuth: azimuth + dx, elevation: clamp(elevation + dy, -90, 90) });
     this.moveTo(index, there.azimuth, there.elevation);
   }
 
   moveTo(index, azimuth, elevation) {
-    this.preview(index, { azimuth: round(((azimuth % 360) + 360) % 360), elevation: round(Math.max(-90, Math.min(90, elevation))) });
+    this.preview(index, { azimuth: round(((azimuth % 360) + 360) % 360), elevation: round(clamp(elevation, -90, 90)) });
   }
 
   // Change flux or size of a light as it was when a drag began, by pixels upwards.
   stretch(index, light, pixels, ofFlux) {
     const factor = 2 ** (pixels / PIXELS_A_STOP);
     if (ofFlux) this.preview(index, { flux: light.entry.flux.map((v) => Math.min(1e6, v * factor)) });
-    else this.preview(index, { size: Math.max(0.01, Math.min(mostSize(light), round(light.entry.size * factor))) });
+    else this.preview(index, { size: clamp(round(light.entry.size * factor), 0.01, mostSize(light)) });
   }
 
   drag(event, index) {
     if (event.button !== 0 || this.turning) return;
-    event.preventDefault();
-    event.stopPropagation();
+    consume(event);
     this.choose(index);
     const handle = event.currentTarget, box = this.stack.getBoundingClientRect();
     const light = this.list()[index], start = [event.clientX, event.clientY];
     handle.focus();
-    handle.setPointerCapture(event.pointerId);
-    handle.onpointermove = (e) => {
+    follow(handle, event, (e) => {
       const dx = ((e.clientX - start[0]) / box.width) * 360, dy = ((e.clientY - start[1]) / box.height) * 180;
       if (e.shiftKey || e.ctrlKey) this.stretch(index, light, start[1] - e.clientY, e.ctrlKey);
       else if (dx || dy) this.moveBy(index, light, dx, -dy);
-    };
-    handle.onpointerup = handle.onpointercancel = () => {
-      handle.onpointermove = handle.onpointerup = handle.onpointercancel = null;
-      this.commit();
-    };
+    }, () => this.commit());
   }
 
   key(event, index) {
-    const move = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] }[event.key];
+    const move = ARROWS[event.key];
     if (move) {
       const step = event.shiftKey ? 5 : 1;
       this.moveBy(index, this.list()[index], move[0] * step, move[1] * step);
@@ -121,8 +116,7 @@ export class Lights {
     } else if (event.key === "Delete") this.remove();
     else if (event.key === "Enter" || event.key === " ") this.choose(index);
     else return;
-    event.preventDefault();
-    event.stopPropagation();
+    consume(event);
   }
 
   wheel(event, index) {
@@ -141,18 +135,15 @@ export class Lights {
     event.preventDefault();
     const start = event.clientX, before = this.on.document().rotate_degrees, width = this.stack.clientWidth;
     let degrees = before;
-    this.holder.setPointerCapture(event.pointerId);
-    this.holder.onpointermove = (e) => {
+    follow(this.holder, event, (e) => {
       degrees = round((before - ((e.clientX - start) / width) * 360) % 360);
       this.draft = { ...this.on.document(), rotate_degrees: degrees };
       this.on.preview({ rotate_degrees: degrees });
       this.draw();
-    };
-    this.holder.onpointerup = this.holder.onpointercancel = () => {
-      this.holder.onpointermove = this.holder.onpointerup = this.holder.onpointercancel = null;
+    }, () => {
       this.draft = null;
       if (degrees !== before) this.on.done({ rotate_degrees: degrees });
-    };
+    });
   }
 
   choose(index) {
@@ -234,10 +225,7 @@ export class Lights {
     lights.forEach((light, i) => {
       let handle = this.holder.querySelectorAll(".handle")[i];
       if (!handle) {
-        handle = window.document.createElement("button");
-        handle.className = "handle";
-        handle.dataset.testid = `handle-${i + 1}`;
-        handle.textContent = i + 1;
+        handle = button(`handle-${i + 1}`, i + 1, { className: "handle" });
         handle.addEventListener("pointerdown", (e) => this.drag(e, i));
         handle.addEventListener("keydown", (e) => this.key(e, i));
         handle.addEventListener("focus", () => this.choose(i));
@@ -246,17 +234,15 @@ export class Lights {
       }
       const muted = off(light);
       handle.classList.toggle("muted", muted);
-      handle.setAttribute("aria-pressed", String(i === this.chosen));
-      handle.setAttribute("aria-label", `${light.own ? "Light" : "Added light"} ${i + 1}${light.entry.name ? `, ${light.entry.name}` : ""}${light.entry.role ? `, ${light.entry.role} light` : ""}: azimuth ${light.azimuth.toFixed(0)}, elevation ${light.elevation.toFixed(0)} degrees${muted ? ", muted" : ""}; arrow keys move it`);
+      handle.ariaPressed = String(i === this.chosen);
+      handle.ariaLabel = `${light.own ? "Light" : "Added light"} ${i + 1}${light.entry.name ? `, ${light.entry.name}` : ""}${light.entry.role ? `, ${light.entry.role} light` : ""}: azimuth ${light.azimuth.toFixed(0)}, elevation ${light.elevation.toFixed(0)} degrees${muted ? ", muted" : ""}; arrow keys move it`;
       place(handle, seen(document, light));
     });
     this.holder.querySelectorAll(".found").forEach((ring) => ring.remove());
     const solved = !this.draft && document.strokes.length > 0;
     this.panel.hint.hidden = !solved || !this.found.length;
     if (solved) for (const light of this.found) {
-      const ring = window.document.createElement("span");
-      ring.className = "found";
-      ring.title = "where the solution has this light";
+      const ring = Object.assign(window.document.createElement("span"), { className: "found", title: "where the solution has this light" });
       place(ring, light);
       this.holder.append(ring);
     }
@@ -285,7 +271,7 @@ export class Lights {
     softness.disabled = shape.value === "gaussian";
     fluxValue.textContent = muted ? "off" : `${signed(stops(light, this.unit))} st`;
     sizeValue.textContent = `${+degrees(light).toPrecision(2)}°`;
-    mute.setAttribute("aria-pressed", String(muted));
+    mute.ariaPressed = String(muted);
     remove.disabled = Boolean(light.own);
   }
 }

@@ -4,6 +4,7 @@ import { Chooser } from "./chooser.js";
 import { Compare } from "./compare.js";
 import { Connection } from "./connection.js";
 import { Display } from "./display.js";
+import { $, button } from "./elements.js";
 import { EMPTY, History } from "./history.js";
 import { Level } from "./level.js";
 import { LightList } from "./light_list.js";
@@ -12,7 +13,6 @@ import { Regions } from "./regions.js";
 import { Strokes } from "./strokes.js";
 import { Zoom } from "./zoom.js";
 
-const $ = (id) => document.getElementById(id);
 const displays = {
   render: new Display($("render"), "radiance"),
   map: new Display($("map"), "radiance"),
@@ -107,14 +107,12 @@ function explain(message) {
   if (!message.explanations.length) frames.explanation = [];
   explanations = message.explanations.map(() => new Display(document.createElement("canvas"), "radiance"));
   $("explanations").replaceChildren(...message.explanations.map(({ name, reached }, i) => {
-    const button = document.createElement("button");
-    button.dataset.testid = `explanation-${i}`;
-    button.setAttribute("aria-pressed", String(i === message.chosen));
-    button.append(explanations[i].canvas, `${name}: ${percent(reached)}`);
-    button.addEventListener("click", () => connection.send({ type: "choose", explanation: i }));
+    const act = () => connection.send({ type: "choose", explanation: i });
+    const chosen = button(`explanation-${i}`, explanations[i].canvas, { ariaPressed: String(i === message.chosen) }, act);
+    chosen.append(`${name}: ${percent(reached)}`);
     explanations[i].set({ stops: Number($("exposure").value), curve: Number($("tonemap").value) });
     if (frames.explanation[i]) explanations[i].show(frames.explanation[i]);
-    return button;
+    return chosen;
   }));
 }
 
@@ -125,11 +123,8 @@ function tabs(names) {
   view = Math.min(view, names.length - 1);
   $("views").hidden = names.length < 2;
   $("views").replaceChildren(...names.map((name, i) => {
-    const tab = Object.assign(document.createElement("button"), { textContent: name, id: `view-${i}` });
-    tab.dataset.testid = `view-${i}`;
-    tab.setAttribute("role", "tab");
+    const tab = button(`view-${i}`, name, { id: `view-${i}`, role: "tab" }, () => chooseView(i));
     tab.setAttribute("aria-controls", "render-stack");
-    tab.addEventListener("click", () => chooseView(i));
     tab.addEventListener("keydown", (event) => {
       const step = { ArrowRight: 1, ArrowLeft: -1 }[event.key];
       if (!step) return;
@@ -146,7 +141,7 @@ function chooseView(i) {
   if (i !== view && (strokes.drawing || strokes.corners)) strokes.cancel();
   view = i;
   [...$("views").children].forEach((tab, k) => {
-    tab.setAttribute("aria-selected", String(k === i));
+    tab.ariaSelected = String(k === i);
     tab.tabIndex = k === i ? 0 : -1;
   });
   for (const kind of ["before", "render", "difference", "unreachable"]) if (frames[kind][i]) show(frames[kind][i]);
@@ -248,15 +243,10 @@ function percent(share) { return `${Math.round(100 * share)} %`; }
 function advise(advice) {
   $("advice").hidden = !advice;
   $("advice-text").textContent = advice?.text ?? "";
-  $("advice-do").replaceChildren(...(advice?.actions ?? []).map(({ label, change }, i) => {
-    const button = Object.assign(document.createElement("button"), { textContent: label, title: "Ctrl+Z takes it back" });
-    button.dataset.testid = `advice-${i}`;
-    button.addEventListener("click", () => {
-      advise(null);
-      history.push(change);
-    });
-    return button;
-  }));
+  $("advice-do").replaceChildren(...(advice?.actions ?? []).map(({ label, change }, i) => button(`advice-${i}`, label, { title: "Ctrl+Z takes it back" }, () => {
+    advise(null);
+    history.push(change);
+  })));
 }
 
 function state(name, text) {
@@ -450,7 +440,7 @@ function orient(document) {
 function choose(name, value) {
   if (name === "tool") tool = value;
   else shape = value;
-  for (const button of document.querySelectorAll(`[data-${name}]`)) button.setAttribute("aria-pressed", String(button.dataset[name] === value));
+  for (const button of document.querySelectorAll(`[data-${name}]`)) button.ariaPressed = String(button.dataset[name] === value);
   for (const label of document.querySelectorAll("[data-for]")) {
     const wanted = label.dataset.for.split(" ");
     label.hidden = wanted[0] === "size" ? shape !== "brush" && shape !== "line" : !wanted.includes(tool);
@@ -491,7 +481,7 @@ $("region").addEventListener("click", () => { if (regions.active && lights.turni
 $("turn").addEventListener("click", () => {
   lights.turning = !lights.turning;
   if (lights.turning && regions.active) regions.toggle();
-  $("turn").setAttribute("aria-pressed", String(lights.turning));
+  $("turn").ariaPressed = String(lights.turning);
   $("handles").classList.toggle("turning", lights.turning);
 });
 $("exposure").addEventListener("input", () => look({ stops: Number($("exposure").value) }));
@@ -544,7 +534,7 @@ for (const [id, key, nothing] of [["map-exposure", "exposure", 0], ["map-tempera
 
 function outline() {
   outlined = !outlined;
-  $("outlines").setAttribute("aria-pressed", String(outlined));
+  $("outlines").ariaPressed = String(outlined);
   strokes.draw();
 }
 

@@ -1,5 +1,6 @@
 // Regions of the map as in [[input.regions]]: painted by a brush, shown over the map, and changed in a panel.
 
+import { ARROWS, button, clamp, consume, follow } from "./elements.js";
 import { direction, unseen } from "./orientation.js";
 
 const WIDTH = 256, HEIGHT = 128; // pixels of what is shown over the map
@@ -32,7 +33,7 @@ export class Regions {
 
   toggle() {
     this.canvas.hidden = this.panel.set.hidden = this.active;
-    this.panel.button.setAttribute("aria-pressed", String(this.active));
+    this.panel.button.ariaPressed = String(this.active);
     this.holder.classList.toggle("brushing", this.active);
     this.points = this.cursor = null;
     this.draw();
@@ -51,8 +52,8 @@ export class Regions {
 
   // The place of the file under a pointer, [azimuth, elevation].
   at(event) {
-    const box = this.stack.getBoundingClientRect(), inside = (v) => Math.max(0, Math.min(1, v));
-    return this.place(360 * inside((event.clientX - box.x) / box.width), 90 - 180 * inside((event.clientY - box.y) / box.height));
+    const box = this.stack.getBoundingClientRect();
+    return this.place(360 * clamp((event.clientX - box.x) / box.width, 0, 1), 90 - 180 * clamp((event.clientY - box.y) / box.height, 0, 1));
   }
   place(azimuth, elevation) {
     const there = unseen(this.on.document(), { azimuth, elevation });
@@ -62,10 +63,8 @@ export class Regions {
   down(event) {
     if (!this.active || event.button !== 0 || event.target !== this.holder) return;
     event.preventDefault();
-    this.holder.setPointerCapture(event.pointerId);
     this.begin(this.at(event));
-    this.holder.onpointerup = () => this.end();
-    this.holder.onpointercancel = () => this.cancel();
+    follow(this.holder, event, null, () => this.end(), () => this.cancel());
   }
 
   hover(event) {
@@ -83,22 +82,19 @@ export class Regions {
   end() {
     if (!this.points) return;
     const region = { ...this.settings(), points: this.points, radius: Number(this.panel.radius.value) };
-    this.points = this.holder.onpointerup = this.holder.onpointercancel = null;
+    this.points = null;
     this.on.done({ regions: [...this.list(), region] });
     this.choose(this.list().length - 1);
   }
 
-  cancel() {
-    this.points = this.holder.onpointerup = this.holder.onpointercancel = null;
-    this.draw();
-  }
+  cancel() { this.points = null; this.draw(); }
 
   // Arrows move the brush, space begins and ends a stroke.
   key(event) {
-    const move = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] }[event.key];
+    const move = ARROWS[event.key];
     if (move) {
       const step = event.shiftKey ? 10 : 2, { azimuth, elevation } = this.keyed ?? { azimuth: 180, elevation: 30 };
-      this.keyed = { azimuth: (azimuth + step * move[0] + 360) % 360, elevation: Math.max(-90, Math.min(90, elevation + step * move[1])) };
+      this.keyed = { azimuth: (azimuth + step * move[0] + 360) % 360, elevation: clamp(elevation + step * move[1], -90, 90) };
       this.cursor = this.place(this.keyed.azimuth, this.keyed.elevation);
       if (this.points) this.go(this.cursor);
     } else if (event.key === " " && this.cursor) this.points ? this.end() : this.begin(this.cursor);
@@ -106,8 +102,7 @@ export class Regions {
     else if (event.key === "Delete") this.remove();
     else return;
     this.draw();
-    event.preventDefault();
-    event.stopPropagation();
+    consume(event);
   }
 
   // ---- the panel
@@ -155,7 +150,7 @@ export class Regions {
     regions.forEach(({ action }, i) => {
       const chip = list.children[i] ?? list.appendChild(this.chip(i));
       chip.textContent = `${i + 1} ${NAMES[action]}`;
-      chip.setAttribute("aria-pressed", String(i === this.chosen));
+      chip.ariaPressed = String(i === this.chosen);
     });
     remove.disabled = this.chosen < 0;
     scaled.hidden = this.panel.action.value !== "scale";
@@ -163,10 +158,8 @@ export class Regions {
   }
 
   chip(i) {
-    const chip = Object.assign(document.createElement("button"), { title: "Choose this region; again: none" });
-    chip.dataset.testid = `region-${i + 1}`;
-    chip.addEventListener("click", () => this.choose(i === this.chosen ? -1 : i));
-    return chip;
+    const title = "Choose this region; again: none";
+    return button(`region-${i + 1}`, "", { title }, () => this.choose(i === this.chosen ? -1 : i));
   }
 
   // ---- what is shown over the map
@@ -217,7 +210,7 @@ function weightsOf(places, { points, radius, polygon, softness }, most) {
     if (polygon) { weights[i] = most * within(polygon, azimuth, elevation); return; }
     let away = Infinity;
     for (const [a, b] of arcs) away = Math.min(away, fromArc(at, a, b));
-    const t = Math.max(0, Math.min(1, 1 + (radius - away / RADIANS) / fade));
+    const t = clamp(1 + (radius - away / RADIANS) / fade, 0, 1);
     weights[i] = most * t * t * (3 - 2 * t);
   });
   return weights;
@@ -239,7 +232,7 @@ function within(corners, azimuth, elevation) {
 const toward = ([azimuth, elevation]) => direction({ azimuth, elevation });
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
-const angle = (a, b) => Math.acos(Math.max(-1, Math.min(1, dot(a, b))));
+const angle = (a, b) => Math.acos(clamp(dot(a, b), -1, 1));
 
 // The angle from an arc of a great circle.
 function fromArc(at, a, b) {

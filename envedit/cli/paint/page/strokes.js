@@ -1,5 +1,7 @@
 // Pointer, pen and keyboard on the rendering: strokes as the configuration has them ([[target.strokes]]).
 
+import { ARROWS, clamp, consume } from "./elements.js";
+
 const STEP = 0.015; // of the width, for the arrow keys
 
 export class Strokes {
@@ -25,7 +27,7 @@ export class Strokes {
 
   at(event) {
     const box = this.overlay.getBoundingClientRect();
-    return [(event.clientX - box.left) / box.width, (event.clientY - box.top) / box.height].map((v) => Math.min(1, Math.max(0, v)));
+    return [(event.clientX - box.left) / box.width, (event.clientY - box.top) / box.height].map((v) => clamp(v, 0, 1));
   }
 
   down(event) {
@@ -90,11 +92,11 @@ export class Strokes {
   cancel() { this.reset(); this.dragging = false; this.on.cancel(); this.draw(); }
 
   key(event) {
-    const move = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[event.key];
+    const move = ARROWS[event.key], step = STEP * (event.shiftKey ? 4 : 1);
     if (event.ctrlKey || event.metaKey || event.altKey) return;
     if (move) {
       this.shown = true;
-      this.cursor = this.cursor.map((v, i) => Math.min(1, Math.max(0, v + move[i] * STEP * (event.shiftKey ? 4 : 1))));
+      this.cursor = [clamp(this.cursor[0] + step * move[0], 0, 1), clamp(this.cursor[1] - step * move[1], 0, 1)];
       if (this.dragging) this.on.drag("move", ...this.cursor);
       else if (this.drawing) { this.add(this.cursor); this.tell(); }
     } else if (event.key === " ") {
@@ -104,8 +106,7 @@ export class Strokes {
     } else if (event.key === "Enter") this.close();
     else if (event.key === "Escape" && (this.dragging || this.drawing || this.corners)) this.cancel();
     else return;
-    event.preventDefault();
-    event.stopPropagation();
+    consume(event);
     this.draw();
   }
 

@@ -27,7 +27,7 @@ from typing import Any
 
 from envedit.cli.console import make_parser
 from envedit.core import interrupts, machine
-from envedit.core.atomic_files import opened, write_atomically
+from envedit.core.atomic_files import write_atomically
 from envedit.core.errors import InputError, MachineError
 
 ALBEDO = 0.5
@@ -40,14 +40,8 @@ _TIMEOUT_SECONDS = 300  # a cold start on a loaded machine takes ten
 _LLVM_REMEDY = (
     "install LLVM 19 (apt-get install libllvm19) or set DRJIT_LIBLLVM_PATH to the path of its libLLVM"
 )
-# Where Dr.Jit and the dynamic loader find libraries; a change there ends the validity of a remembered probe.
-_LIBRARIES = (
-    "/usr/lib/*-linux-gnu/libLLVM*",
-    "/usr/lib64/libLLVM*",
-    "/usr/lib/libLLVM*",
-    "/usr/local/lib/libLLVM*",
-    "/opt/homebrew/opt/llvm/lib/libLLVM*",
-)
+# Where Dr.Jit and the dynamic loader find libraries.
+_FOLDERS = ("/usr/lib/*-linux-gnu", "/usr/lib64", "/usr/lib", "/usr/local/lib", "/opt/homebrew/opt/llvm/lib")
 
 
 @dataclass(frozen=True)
@@ -118,28 +112,22 @@ def check(variant: str = "llvm_ad_rgb") -> Diagnosis:
 def ensure(variant: str = "llvm_ad_rgb") -> None:
     """Raise MachineError unless this machine can run a variant; cheap after the first success.
 
-    A success is remembered in ``$XDG_CACHE_HOME/envedit`` (or ``~/.cache/envedit``) until the versions of
-    Python, mitsuba or drjit, the LLVM library used or those installed change. Only success is remembered. A
-    cache that cannot be written costs a probe every time and nothing else.
+    A success is remembered in ``$XDG_CACHE_HOME/envedit`` (or ``~/.cache/envedit``) until Python, mitsuba,
+    drjit or an LLVM library that is installed changes. Only success is remembered, with an LLVM whose changes
+    would be seen. A cache that cannot be written costs a probe every time and nothing else.
     """
-    # ---- A success that is remembered
     memory = _memory(variant)
-    with contextlib.suppress(OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
-        with opened(memory or "") as file:  # without a folder: no such file
-            known = json.loads(file.read(1 << 16))
-        if known["ok"] is True and known["library"] == _stamp(known["library"][0]):
-            return
-
-    # ---- A new probe
+    if memory is not None and memory.exists():
+        return
     diagnosis = check(variant)
     if not diagnosis.ok:
         raise MachineError("\n".join(diagnosis.lines))
-    # A stamp of None (no library file is seen on this system) would never prove a change: then probe again.
-    stamp = _stamp(diagnosis.versions.get("llvm_path"))
-    if memory is not None and (stamp or not variant.startswith("llvm")):
+    library = os.path.realpath(diagnosis.versions.get("llvm_path") or "")
+    seen = library in map(os.path.realpath, _libraries()) or not variant.startswith("llvm")
+    if memory is not None and seen:
         with contextlib.suppress(OSError, RuntimeError, InputError):
             memory.parent.mkdir(parents=True, exist_ok=True)
-            write_atomically(memory, json.dumps({"ok": True, "library": stamp or [None]}).encode())
+            write_atomically(memory, b"")
 
 
 def select(variant: str = "llvm_ad_rgb") -> None:
@@ -205,24 +193,20 @@ def _memory(variant: str) -> Path | None:
     """Return the file that remembers a success for this variant, these packages and these libraries."""
     from envedit.core.array_cache import cache_home  # with numpy
 
-    libraries = sorted(name for pattern in _LIBRARIES for name in glob.glob(pattern))
+    libraries = [(name, os.stat(name).st_size, os.stat(name).st_mtime_ns) for name in _libraries()]
     versions = [machine.version("mitsuba"), machine.version("drjit")]
-    parts = [variant, sys.version, sys.executable, *versions, libraries]
-    parts += [os.environ.get(name) for name in ("DRJIT_LIBLLVM_PATH", "LD_LIBRARY_PATH")]
-    key = hashlib.sha256(repr(parts).encode()).hexdigest()[:16]
+    named = [os.environ.get(name) for name in ("DRJIT_LIBLLVM_PATH", "LD_LIBRARY_PATH")]
+    key = hashlib.sha256(repr([variant, sys.version, sys.executable, versions, libraries, named]).encode())
     home = cache_home()
-    return None if home is None else home / f"doctor-{key}.json"
+    return None if home is None else home / f"doctor-{key.hexdigest()[:16]}"
 
 
-def _stamp(path: str | None) -> list | None:
-    """Return [path, size, modification time] of a library, [None] for none, None if it cannot be read."""
-    if path is None:
-        return [None]
-    try:
-        status = os.stat(path)
-    except OSError:
-        return None
-    return [path, status.st_size, status.st_mtime_ns]
+def _libraries() -> list[str]:
+    """List the files of LLVM libraries that Dr.Jit may load."""
+    searched = os.environ.get("LD_LIBRARY_PATH", "").split(os.pathsep)
+    folders = [*_FOLDERS, f"{sys.prefix}/lib", *filter(None, searched)]
+    found = [name for folder in folders for name in glob.glob(f"{folder}/libLLVM*")]
+    return sorted(filter(os.path.isfile, [*found, os.environ.get("DRJIT_LIBLLVM_PATH", "")]))
 
 
 # ---- The child ---------------------------------------------------------------------------------------------

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from envedit.cli import doctor, map_command
+from envedit.cli.map_command import number
 from envedit.core.errors import ConfigError
 
 FACTS = ("kind", "reason", "azimuth", "elevation", "radius", "level")
@@ -31,13 +30,13 @@ def main(argv: list[str] | None = None) -> int:
     override = parser.add_mutually_exclusive_group()
     override.add_argument(
         "--flux",
-        type=float,
+        type=number(0, 1e30),
         nargs="+",
         metavar="E",
         help="the sun's irradiance on a surface that faces it, in the map's units: luminance, or R G B",
     )
     override.add_argument(
-        "--ratio", type=float, help="the sun's horizontal irradiance over the sky's, luminance"
+        "--ratio", type=number(1e-6, 1e6), help="the sun's horizontal irradiance over the sky's, luminance"
     )
     return map_command.run(parser, argv, _unclip)
 
@@ -46,7 +45,8 @@ def _unclip(arguments, console):
     from envedit.maps import map_file
     from envedit.representations.layers import clipped_light, unclip
 
-    _check(arguments)
+    if arguments.flux is not None and (len(arguments.flux) not in (1, 3) or not any(arguments.flux)):
+        raise ConfigError(f"--flux: got {arguments.flux}, expected 1 or 3 numbers above 0")
     path = map_file.output_path(arguments.out, "unclipped", [arguments.map], arguments.overwrite)
     doctor.select()
     input_map = map_command.read(arguments.map, arguments, console)
@@ -82,16 +82,6 @@ def _unclip(arguments, console):
         console.warn(f"{arguments.map}: {unclip.doubt(light)}")
     values = " ".join(f"{value:.4g}" for value in flux)
     console.say(f"sun of flux {values}{spread}, horizontally {ratio:.2g} times the sky; {path}")
-
-
-def _check(arguments):
-    flux, ratio = arguments.flux, arguments.ratio
-    if flux is not None and len(flux) not in (1, 3):
-        raise ConfigError(f"--flux: got {len(flux)} numbers, expected 1 or 3")
-    if flux is not None and not (min(flux) >= 0 and 0 < sum(flux) < math.inf):
-        raise ConfigError(f"--flux: got {flux}, expected positive numbers")
-    if ratio is not None and not 0 < ratio < math.inf:
-        raise ConfigError(f"--ratio: got {ratio}, expected a positive number")
 
 
 def _flux(arguments, light):

@@ -127,9 +127,3 @@ def test_a_budget_that_cannot_be_kept_ends_before_anything_is_made(small, capsys
     assert run.main([str(small), "--budget", "0.1s", "--out", str(out)]) == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1 and "cannot be kept" in error and not list(out.glob("*.exr"))
-
-
-@pytest.mark.parametrize("other", [["--resume"], ["--export-initial", "a.exr"]])
-def test_a_budget_goes_with_neither_resume_nor_export(small, other):
-    with pytest.raises(SystemExit):
-        run.main([str(small), "--budget", "30", *other])

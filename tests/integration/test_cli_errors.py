@@ -52,9 +52,12 @@ def test_a_configuration_that_cannot_be_understood_or_is_not_there(tmp_path, cap
     assert "a folder" in fails(2, capsys, tmp_path)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "says"), [([], "CONFIG.toml"), (["c.toml", "--preset", "best"], "best")]
-)
+@pytest.mark.parametrize(("arguments", "says"), [
+    ([], "CONFIG.toml"),
+    (["c.toml", "--preset", "best"], "best"),
+    (["c.toml", "--resume", "--export-initial", "a.png"], "not allowed with"),
+    (["c.toml", "--budget", "30", "--resume"], "not allowed with"),
+])  # fmt: skip
 def test_a_bad_command_line(arguments, says, capsys):
     with pytest.raises(SystemExit) as stop:
         run.main(arguments)
@@ -74,12 +77,6 @@ def test_an_export_is_a_picture_that_is_not_there(path, capsys, tmp_path):
     assert "link.png" in fails(3, capsys, path, export, tmp_path / "link.png")
     assert not (tmp_path / "nowhere.png").exists()
     assert "folder" in fails(3, capsys, path, export, tmp_path / "none" / "a.png")
-
-
-def test_an_export_does_not_resume(path, capsys, tmp_path):
-    with pytest.raises(SystemExit) as stop:
-        call(path, "--resume", "--export-initial", tmp_path / "a.png")
-    assert stop.value.code == 2 and "not allowed with" in capsys.readouterr().err
 
 
 # ---- files: 3 --------------------------------------------------------------------------------------------

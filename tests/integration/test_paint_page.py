@@ -1,7 +1,6 @@
 """``envedit paint`` in a real browser: paint, drag, undo, save, reopen."""
 
 import contextlib
-import os
 import re
 import shutil
 import time
@@ -25,7 +24,6 @@ sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not 
 pytest.importorskip("starlette", reason="the extra envedit[paint] is not installed")
 pytest.importorskip("uvicorn", reason="the extra envedit[paint] is not installed")
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-SHOTS = os.environ.get("ENVEDIT_SHOTS")  # folder for pictures of the page, to be looked at
 
 
 @pytest.fixture(scope="module")
@@ -109,10 +107,6 @@ class Page:
     def named_and_legible(self):
         assert not self.page.evaluate(UNNAMED) and not self.page.evaluate(FAINT)
 
-    def shot(self, name):
-        if SHOTS:
-            self.page.screenshot(path=f"{SHOTS}/{name}.png")
-
 
 @pytest.fixture
 def file(tmp_path):
@@ -139,7 +133,6 @@ def test_paint_drag_undo_save_and_reopen(browser, file):
         page.drag(*(page.at("#overlay", 0.2 + 0.1 * k, 0.82) for k in range(5)))
         page.page.wait_for_function("() => envedit.log.some((e) => e.phase === 'done')")
         page.settled(False)
-        page.shot("painted")
         assert page.picture("map") != begun, "the map did not follow the stroke"
         assert 'type = "shadow"' in kept.read_text(), "the stroke was not kept"
         page.page.locator("#details summary").click()
@@ -160,7 +153,6 @@ def test_paint_drag_undo_save_and_reopen(browser, file):
         page.get("save").click()
         sync_api.expect(page.get("message")).to_contain_text("Saved in", timeout=240_000)
         sync_api.expect(page.get("message")).to_contain_text("differs from the one shown")
-        page.shot("saved")
         assert all(url.startswith((server.url, "data:")) for url in page.asked), "the page asks elsewhere"
 
     with served(kept) as server:
@@ -168,7 +160,6 @@ def test_paint_drag_undo_save_and_reopen(browser, file):
         page.settled(False)
         sync_api.expect(page.get("undo")).to_be_enabled()
         assert "elevation" in page.get("handle-1").get_attribute("aria-label")
-        page.shot("reopened")
         assert not page.faults, page.faults
 
 
@@ -181,7 +172,6 @@ def test_another_explanation_is_chosen(browser, file):
         page.drag(*(page.at("#overlay", 0.52 + 0.04 * k, 0.3) for k in range(5)))
         sync_api.expect(page.get("explanation-1")).to_contain_text("%")
         page.settled(False)
-        page.shot("explanations")
         before = page.picture("map")
         page.get("explanation-1").click()
         sync_api.expect(page.get("explanation-1")).to_have_attribute("aria-pressed", "true")
@@ -233,7 +223,6 @@ def test_a_shadow_is_dragged_and_what_goes_along_is_chosen(browser, file):
         page.page.evaluate(f"(advice) => {{ envedit.advise(advice); {button}.click(); }}", advice)
         until(lambda: "azimuth = 200" in kept.read_text() and "[[target.strokes]]" not in kept.read_text())
         assert config.load(kept).input.lights[0]["flux"] == [0.5, 0.5, 0.5]
-        page.shot("advised")
 
 
 def size_and_flux_are_dragged(page, lights):
@@ -286,7 +275,6 @@ def an_image_is_put_on_the_light(page, lights, folder):
     until(lambda: lights()[0]["shape"] == "image" and "aspect" not in lights()[0])
     taken = folder / "images" / "softbox.png"
     assert lights()[0]["image"] == str(taken) and taken.read_bytes() == softbox.read_bytes()
-    page.shot("image")
     page.get("undo").click()
     until(lambda: lights()[0]["shape"] == "strip")
 
@@ -317,7 +305,6 @@ def test_lights_are_placed_by_clicks_and_shaped(browser, file, tmp_path, here):
             control = page.get(f"light-{key}")
             control.select_option(value) if key == "shape" else control.fill(value)
             until(lambda key=key, value=value: str(lights()[0].get(key)) in (value, f"{value}.0"))
-        page.shot("shaped")
         an_image_is_put_on_the_light(page, lights, tmp_path)
         page.get("undo").click()
         until(lambda: lights()[0]["aspect"] == 0.1)
@@ -335,7 +322,6 @@ def test_lights_are_placed_by_clicks_and_shaped(browser, file, tmp_path, here):
         sync_api.expect(message).to_contain_text(re.compile("Light of this place: .*rest of the map"))
         a_highlight_is_dragged(page, lights)
         page.settled(False)
-        page.shot("placed")
         each_kind_of_stroke_is_painted(page, kept)
 
 
@@ -370,7 +356,6 @@ def lights_are_listed(page, kept):
     assert "muted" in kept.read_text(), "solo was kept"
     get("list-choose-2").click()
     sync_api.expect(get("handle-2")).to_have_attribute("aria-pressed", "true")
-    page.shot("lights")
 
 
 def states_are_compared(page, kept):
@@ -389,7 +374,6 @@ def states_are_compared(page, kept):
     get("past").click()
     steps = get("steps").locator("button")
     assert steps.count() == 9 and steps.nth(8).locator("canvas").count() == 1
-    page.shot("steps")
     get("back-a").click()
     until(lambda: "muted" in kept.read_text())
     get("step-0").click()
@@ -441,7 +425,6 @@ def map_is_large_and_rendering_zoomed(page):
     sync_api.expect(page.page.locator("#sky-size")).to_have_text("64 x 32 texels")
     page.get("sky-split").fill("0.5")
     page.named_and_legible()
-    page.shot("large")
     page.get("sky-close").click()
     rendering = page.page.locator("#overlay")
     before = rendering.bounding_box()
@@ -492,7 +475,6 @@ def map_is_levelled(page, kept, session):
     (light,) = config.load(kept).input.lights
     moved = angles(Orientation(100, 12, 5).matrix @ direction(light["azimuth"], light["elevation"]))
     assert moved == pytest.approx((azimuth + 1, elevation), abs=0.05)
-    page.shot("level")
     page.named_and_legible()
     get("undo").click()
     get("undo").click()
@@ -542,7 +524,6 @@ def regions_are_painted(page, kept, session):
     get("regions").press("Space")
     until(lambda: [one["action"] for one in regions()] == ["scale", "keep"])
     assert len(regions()[1]["points"]) == 2 and regions()[1]["radius"] == 5
-    page.shot("regions")
     page.named_and_legible()
     get("region-remove").click()
     until(lambda: len(regions()) == 1)
@@ -566,7 +547,6 @@ def test_a_map_is_chosen_levelled_and_painted_on(browser, file, tmp_path, here):
         page.page.wait_for_function(shown)
         tile.click()
         sync_api.expect(tile).to_have_attribute("aria-pressed", "true")
-        page.shot("start")
         page.named_and_legible()
         page.get("open-name").fill("edit.toml")
         page.get("open").click()
@@ -585,7 +565,6 @@ def test_a_map_is_chosen_levelled_and_painted_on(browser, file, tmp_path, here):
         until(
             lambda: np.allclose(server.worker.session.placed.lights[0].direction, direction(90, 30), atol=0.1)
         )
-        page.shot("look")
         assert not page.faults, page.faults
 
 
@@ -612,7 +591,6 @@ def test_views_as_tabs_names_focus_order_and_contrast(browser, tmp_path):
         until(lambda: kept.exists() and "view = 1" in kept.read_text())
         (stroke,) = config.load(kept).target.strokes
         assert stroke["amount"] == pytest.approx(0.6 / 2**stops, rel=1e-3), "not of what is shown as white"
-        page.shot("views")
 
         page.named_and_legible()
         page.get("undo").focus()
@@ -635,7 +613,6 @@ def test_a_photograph_is_compared_with_the_rendering(browser, tmp_path):
         page.settled(False)
         matched = page.picture("render")
         get("split").fill("0.5")
-        page.shot("photograph")
         get("split").fill("1")
         photograph = page.picture("render")
         assert photograph != matched
@@ -675,5 +652,4 @@ def test_fingers_paint_and_zoom_on_a_tablet(browser, file):
         for width, height in ((820, 1180), (1024, 768)):
             page.page.set_viewport_size({"width": width, "height": height})
             assert page.page.evaluate("document.documentElement.scrollWidth") == width
-        page.shot("tablet")
     context.close()

@@ -17,6 +17,7 @@ import pytest
 
 from envedit.cli.paint import protocol
 from envedit.cli.paint.protocol import Document
+from tests.oracles import ROOT
 from tests.oracles.painting import SMALL, asked, connected, heard, painted, send, served, until
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("own_core")]
@@ -190,24 +191,20 @@ def test_a_light_that_was_placed_is_told_with_the_number_of_its_edit(server):
 
 def test_a_busy_port_is_told_and_ctrl_c_ends_it(tmp_path):
     command = [sys.executable, "-m", "envedit", "paint", "--no-browser", "--port"]
+    given = os.environ | {"PYTHONPATH": str(ROOT)}
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = str(taken.getsockname()[1])
         done = subprocess.run(
-            [*command, port], cwd=tmp_path, capture_output=True, text=True, timeout=60, env=_env()
+            [*command, port], cwd=tmp_path, capture_output=True, text=True, timeout=60, env=given
         )
     assert done.returncode == 2 and f"port {port} on 127.0.0.1: cannot be used" in done.stderr, done.stderr
     running = subprocess.Popen(
-        [*command, "0"], cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=_env()
+        [*command, "0"], cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=given
     )
     url = running.stdout.readline().split()[-1]
     until(lambda: asked(url)[0] == 200)
     running.send_signal(signal.SIGINT)
     said, wrong = running.communicate(timeout=60)
     assert running.returncode == 0 and "ended" in said and not wrong, wrong
-
-
-def _env():
-    root = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
-    return os.environ | {"PYTHONPATH": root}

@@ -1,12 +1,9 @@
 """The drawing of a history: parsed as XML and read back in page coordinates."""
 
-import re
 import xml.etree.ElementTree as ElementTree
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from envedit.report import curves
 
@@ -38,25 +35,6 @@ def test_curve_is_straight_for_a_geometric_series_and_interrupted_where_there_is
 @pytest.mark.parametrize("row", [{}, {"loss": None}, {"loss": np.nan}, {"loss": 0.0}, {"lr": 1.0}])
 def test_nothing_to_draw_is_an_empty_string(row):
     assert curves.curves_svg([row]) == "" == curves.curves_svg([])
-
-
-@pytest.mark.slow
-@settings(max_examples=60, deadline=None)
-@given(
-    st.lists(
-        st.dictionaries(
-            st.sampled_from(["loss", "a<b>&\"'", "long" * 9, "lr"]),
-            st.one_of(st.none(), st.floats(), st.integers(), st.text(max_size=3), st.booleans()),
-        ),
-        max_size=8,
-    )
-)
-def test_any_history_makes_a_well_formed_drawing(rows):
-    svg = curves.curves_svg(rows)
-    if svg:
-        root = ElementTree.fromstring(svg)
-        drawn = " ".join(" ".join(element.attrib.values()) for element in root.iter())
-        assert not re.search(r"\d?(nan|inf)\b", drawn)
 
 
 @pytest.mark.parametrize("values, labels", [

@@ -160,23 +160,6 @@ def test_what_paint_cannot_solve_is_refused(tmp_path):
         project.opened(str(file))
 
 
-def test_memory_is_given_back_at_rest_and_now_and_then(monkeypatch):
-    given, resting = [], session.Session.__new__(session.Session)
-    monkeypatch.setattr(session, "give_back_memory", lambda: given.append(resting.phase))
-    resting._worked = lambda: True
-    later = np.inf  # what is due
-    for resting.resting, resting._dragged, resting.phase, resting._memory_due, more, times in (
-        (True, False, "done", later, False, 1),
-        (False, True, "dragging", later, False, 1),  # the next frame needs the buffers
-        (False, False, "drawing", later, True, 1),
-        (False, False, "drawing", 0.0, True, 2),
-        (False, True, "dragging", 0.0, False, 3),
-    ):
-        assert resting.advance() == more
-        assert len(given) == times
-    assert resting.advance() is False and len(given) == 3, "given back again at once"
-
-
 @on_cpu
 @pytest.mark.skipif(not os.path.exists("/proc/self/statm"), reason="no /proc")
 def test_what_is_given_back_leaves_the_process():

@@ -24,7 +24,6 @@ from envedit.scene import scene
 from envedit.solve import checkpoint, gauss_newton, likelihood, search
 from envedit.targets.target import Target
 from envedit.transport import sampling_plan
-from envedit.transport.light_transport import LightTransport
 from tests.oracles.builders import BALL, LIGHT, SENSOR, sky, write_scene
 from tests.oracles.matrix_renderer import without_times
 from tests.oracles.runs import HEIGHT, WIDTH, interrupting, merged, settings_of, smooth, sunny
@@ -148,21 +147,6 @@ def test_what_this_view_does_not_determine_changes_less(tmp_path):
     assert known[x < -0.5].mean() < 0.8 * known[x > 0.5].mean()
     assert any("bit for bit" in line for line in found.metrics["choices"])
     assert found.metrics["render"]["psnr"] > found.metrics["initial"]["psnr"] + 8
-
-
-@pytest.mark.slow
-def test_the_error_that_is_told_is_that_of_the_edited_map(tmp_path, rng, monkeypatch):
-    told, predict = [], LightTransport.coarse_error
-
-    def noted(self, envmap):
-        told.append((envmap.copy(), predict(self, envmap)))
-        return told[-1][1]
-
-    monkeypatch.setattr(LightTransport, "coarse_error", noted)
-    found = pipeline.run(settings_of(tmp_path, sunny(rng), optimizer={"iterations": 3}, **PIXELS))
-    ((given, error),) = told
-    assert given.tobytes() == found.envmap.tobytes() != found.maps["initial"].tobytes()
-    assert found.metrics["transport"]["predicted_error"] == error > 0
 
 
 @pytest.mark.slow

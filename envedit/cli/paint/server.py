@@ -31,13 +31,6 @@ from envedit.report import output_folder
 
 HOST = "127.0.0.1"
 PAGE = Path(__file__).parent / "page"
-TYPES = {
-    ".html": "text/html",
-    ".js": "text/javascript",
-    ".css": "text/css",
-    ".svg": "image/svg+xml",
-    ".jpg": "image/jpeg",
-}
 MOST_CLIENTS = 8
 LARGEST_FILE = 1 << 30
 """Bytes of a file that the page sends."""
@@ -198,10 +191,11 @@ class Server:
         if not self._known(request):
             return PlainTextResponse("the address lacks its token: take it from the terminal", 403, _SAFE)
         name = request.path_params.get("name", "index.html")
-        served = {path.name: path for path in PAGE.iterdir() if path.suffix in TYPES}
+        served = {path.name: path for path in PAGE.iterdir()}
         if name not in served:
             return PlainTextResponse("no such file", 404, _SAFE)
-        return FileResponse(served[name], media_type=TYPES[served[name].suffix], headers=_SAFE)
+        script = "text/javascript" if name.endswith(".js") else None  # Windows may have another for it
+        return FileResponse(served[name], media_type=script, headers=_SAFE)
 
     async def _result(self, request: Request) -> Response:
         if not self._known(request):

@@ -64,28 +64,16 @@ def inputs_of(settings: config.Config, base: Path | None = None) -> Iterator[Fil
 
 
 def tidy(folder: Path) -> None:
-    """Remove what killed processes were writing in a folder: temporary names of what a run may leave."""
+    """Remove what killed processes were writing in a folder, in which this one is :func:`alone`.
+
+    That are temporary names of what a run may leave.
+    """
     for path in folder.glob(".*.*.*"):
         stem, ending, writer = path.name[1:].split(".")[:3]
         name = f"{stem}.{ending}"
-        if not (name in RESULTS or _NUMBERED.fullmatch(name)):
-            continue
-        if writer.isdecimal() and not _runs(int(writer)):
+        if writer.isdecimal() and (name in RESULTS or _NUMBERED.fullmatch(name)):
             with contextlib.suppress(OSError):
                 path.unlink()
-
-
-def _runs(process):
-    """Say whether another process of this number runs, as far as is visible without touching it."""
-    if process == os.getpid() or os.name != "posix":
-        return False
-    try:
-        os.kill(process, 0)
-    except (ProcessLookupError, OverflowError):
-        return False
-    except OSError:
-        pass
-    return True
 
 
 @contextlib.contextmanager

@@ -5,6 +5,7 @@ from __future__ import annotations
 import concurrent.futures
 import contextlib
 import dataclasses
+import datetime
 import functools
 import logging
 import re
@@ -204,7 +205,7 @@ class Progress:
         if self._carried_out and self._ended < self._total:
             left = (self._total - self._ended) * (time.monotonic() - self._begun) / self._carried_out
             until = time.strftime("%H:%M", time.localtime(time.time() + left))
-            remarks.append(f"about {_duration(left)} left, until {until}")
+            remarks.append(f"about {datetime.timedelta(seconds=round(left))} left, until {until}")
         self.say(f"{line}; {', '.join(remarks)}" if remarks else line)
 
     def say(self, line: str) -> None:
@@ -217,12 +218,6 @@ class Progress:
         if line not in self._said:
             self._said.add(line)
             self.say(line)
-
-
-def _duration(seconds):
-    if seconds < 100:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"
 
 
 def table(outcomes: Sequence[Outcome]) -> str:

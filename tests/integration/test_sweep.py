@@ -519,8 +519,8 @@ def test_lines_tell_when_it_ends(tmp_path, monkeypatch):
         progress.report(Outcome(job("j", "seed = 1"), state, seconds), tmp_path)
     none_carried_out, *lines = said.getvalue().splitlines()
     assert "left" not in none_carried_out
-    assert "about 2 min left" in lines[0] and "1 failed, about 7 min left" in lines[1]
-    assert "about 3 min left" in lines[2] and "left" not in lines[3]
+    assert "about 0:02:00 left" in lines[0] and "1 failed, about 0:06:40 left" in lines[1]
+    assert "about 0:03:20 left" in lines[2] and "left" not in lines[3]
 
 
 # ---- the real run ------------------------------------------------------------------------------------------

@@ -26,8 +26,6 @@ from envedit.report.verdict import verdict
 if TYPE_CHECKING:
     from envedit.results import Result
 
-NAMED = 5
-"""Numbers that are not finite which a warning names, at most."""
 NUMBERS = {
     "non_finite_steps": "steps that were not finite, and not taken",
     "turn_degrees": "turn of the whole sky (degrees)",
@@ -96,19 +94,14 @@ def write_report(path: FilePath, result: Result, manifest: dict) -> None:
     settings = result.settings
 
     # ---- What is shown
-    lost: list[str] = []
-    metrics = plain(result.metrics, "metrics", lost)
-    plain(result.history, "history", lost)
+    metrics = plain(result.metrics, "", [])
     tonemap = settings.output.tonemap
     renders = preview.known(result.shown)
     maps = preview.known(result.maps)
     names = list(dict.fromkeys([*result.renders, *result.maps]))
     by_view = _by_view(renders, result.views)
 
-    warnings = [*result.warnings]
-    if lost:
-        more = f" and {len(lost) - NAMED} more" if len(lost) > NAMED else ""
-        warnings.append(f"Not finite, shown as missing: {', '.join(lost[:NAMED])}{more}.")
+    warnings = result.warnings
     source = result.given.source if result.given else settings.input.envmap
     title = escape(f"{Path(source).stem}, {Path(settings.scene.file).stem}")
     manifest_text = json.dumps(plain(manifest, "", []), indent=1, ensure_ascii=False)

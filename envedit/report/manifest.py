@@ -1,6 +1,6 @@
 """What a run leaves to be read by programs: history, metrics, and a manifest that explains it later.
 
-Numbers are finite or null; whoever writes learns where one was not.
+Numbers are finite or null.
 """
 
 from __future__ import annotations
@@ -53,16 +53,14 @@ def plain(value: Any, where: str, lost: list[str]) -> Any:
     raise TypeError(f"{where}: {type(value).__name__} cannot be written as JSON")
 
 
-def write_json(path: FilePath, value: Any) -> list[str]:
+def write_json(path: FilePath, value: Any) -> None:
     """Write ``metrics.json``, ``manifest.json`` or ``lights.json``; numbers are finite or null.
 
-    Returns where a NaN or Inf became null, as ``"render.psnr"``, so that the caller can warn. InputError if
-    the file cannot be written; TypeError for what is neither number, text, list, dict, path nor NumPy's.
+    InputError if the file cannot be written; TypeError for what is neither number, text, list, dict, path nor
+    NumPy's.
     """
-    lost: list[str] = []
-    text = json.dumps(plain(value, "", lost), indent=1, allow_nan=False)
+    text = json.dumps(plain(value, "", []), indent=1, allow_nan=False)
     write_atomically(path, text.encode("ascii") + b"\n")
-    return lost
 
 
 def write_history(path: FilePath, rows: list[dict]) -> None:

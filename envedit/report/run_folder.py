@@ -50,7 +50,10 @@ def write(folder: Path, result: results.Result, import_s: float) -> list[str]:
     )
     manifest.write_json(folder / "manifest.json", facts)
 
-    # ---- The report, which shows the time but for its own
+    # ---- The report, which shows the time but for its own, and names what metrics.json will lack
+    lost: list[str] = []
+    manifest.plain(result.metrics, "", lost)
+    result.warnings += [f"metrics.json: {name} was not finite and is null" for name in lost]
     timing = result.metrics["timing"]
     timing["full_s"] = round(maps_written - start, 3)
     timing["import_s"] = round(import_s, 3)
@@ -64,10 +67,10 @@ def write(folder: Path, result: results.Result, import_s: float) -> list[str]:
     timing["total_s"] = round(timing["total_s"] + timing["report_s"], 3)
 
     # ---- metrics.json, which says that the run is complete, and what is no longer needed
-    lost = manifest.write_json(folder / "metrics.json", result.metrics)
+    manifest.write_json(folder / "metrics.json", result.metrics)
     checkpoint.remove(folder)
     output_folder.tidy(folder)
-    return [*result.warnings, *(f"metrics.json: {name} was not finite and is null" for name in lost)]
+    return result.warnings
 
 
 def write_given(

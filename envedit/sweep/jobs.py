@@ -108,11 +108,10 @@ def read_jobs(path: FilePath) -> list[Job]:
         if not (files := sorted(path.glob("*.toml"))):
             raise ConfigError(f"{path}: no configuration NAME.toml in this folder")
         return [job(file.stem, _text(file), path) for file in files]
+    text = _text(path)
     try:
-        tables = tomllib.loads(_text(path))
+        tables = tomllib.loads(text)
     except (ValueError, RecursionError) as error:
-        if isinstance(error, ConfigError):
-            raise
         raise ConfigError(f"{path}: not TOML: {error}") from None
     common = tables.pop("common", {})
     jobs = tables.pop("jobs", {})

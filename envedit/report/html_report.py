@@ -26,34 +26,6 @@ from envedit.report.verdict import verdict
 if TYPE_CHECKING:
     from envedit.results import Result
 
-NUMBERS = {
-    "non_finite_steps": "steps that were not finite, and not taken",
-    "turn_degrees": "turn of the whole sky (degrees)",
-    "sun_offset_texels": "distance between the brightest texels of the edited and of the true map (texels)",
-    "active_rows": "rows that were edited, first and last",
-    "natural colours_outside": "share of the sky in colours that neither map has",
-    "natural seam": "step at the horizon over the original's",
-    "natural high_frequency": "detail of the sky over the original's",
-    "natural white": "share of the sky that is white, less the original's",
-    "natural patches": "patches of the edit, over those between two photographed skies",
-    "painted towards": "share of the painted change that is reached",
-    "painted elsewhere": "change of what was not painted (display values)",
-    "painted reachable": "share of the painted change that is feasible",
-    "fit log_psnr": "fit of the network, log-PSNR (dB)",
-    "fit peak_ratio": "fit, peak over the map's",
-    "fit epochs": "fit, epochs",
-    "fit cached": "fit taken from disk",
-    "transport cached": "light transport (T) taken from disk",
-    "transport entries": "light transport, entries",
-    "transport memory_bytes": "light transport, bytes",
-    "transport columns": "light transport, exact columns",
-    "transport samples": "light transport, samples a pixel",
-    "transport path_depth": "light transport, longest path",
-    "transport depth_error": "light transport, share of the light that longer paths would add",
-    "transport predicted_error": "light transport, predicted relative error",
-    "transport frozen": "share of texels that are frozen",
-}
-"""Numbers of metrics.json in words, where these are not their keys; our terms are in docs/glossary.md."""
 STAGES = {
     "import": "importing",
     "target": "rendering the target",
@@ -301,7 +273,7 @@ def _quality(metrics):
 
 
 def _numbers(metrics):
-    """List the other numbers of the metrics, in words where there are any."""
+    """List the other numbers by their keys of metrics.json, which docs/outputs.md explains."""
     elsewhere = ("choices", "views", "variants", "tonemap", "worse")
     others = {
         key: value
@@ -309,9 +281,9 @@ def _numbers(metrics):
         if not isinstance(value, (dict, type(None))) and key not in elsewhere
     }
     for part in ("natural", "painted", "fit", "transport"):
-        others |= {f"{part} {key}": value for key, value in (metrics.get(part) or {}).items()}
-    rows = [[NUMBERS.get(key, key.replace("_", " ")), parts.show(value)] for key, value in others.items()]
-    return f"<details><summary>Numbers of the run</summary>{parts.table(['', ''], rows)}</details>"
+        others |= {f"{part}.{key}": value for key, value in (metrics.get(part) or {}).items()}
+    rows = [[key, parts.show(value)] for key, value in others.items()]
+    return f"<details><summary>Numbers of metrics.json</summary>{parts.table(['', ''], rows)}</details>"
 
 
 def _timing(metrics):

@@ -42,10 +42,7 @@ table { border-collapse: collapse; font-variant-numeric: tabular-nums; min-width
 th { font-weight: 500; color: var(--soft); }
 th, td { text-align: right; padding: .28rem .9rem; }
 th:first-child, td:first-child { text-align: left; padding-left: 0; }
-td:has(.bar) { text-align: left; }
 tbody tr td { border-top: 1px solid var(--line); }
-.bar { display: inline-block; height: .55rem; background: #b9c3d6; border-radius: 2px;
-  vertical-align: middle; }
 svg.curves { width: 100%; font-size: 12px; fill: var(--soft); }
 svg.curves, pre { background: #fff; border: 1px solid var(--line); border-radius: 3px; }
 svg.curves path { fill: none; stroke-width: 1.4; stroke-linecap: round; stroke-linejoin: round; }

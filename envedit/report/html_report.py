@@ -287,16 +287,13 @@ def _numbers(metrics):
 
 
 def _timing(metrics):
-    """List where the time went, with a bar for each stage."""
-    timing = {key: value for key, value in metrics["timing"].items() if value is not None}
-    longest = max(value for key, value in timing.items() if key.endswith("_s"))
+    """List where the time went."""
     rows = []
-    for key, value in timing.items():
+    for key, value in metrics["timing"].items():
         stage, _, unit = key.rpartition("_")
-        width = 12 * value / max(longest, 1e-3) if unit == "s" else 0
-        bar = f'<span class="bar" style="width:{width:.2f}rem"></span>'
-        rows.append([STAGES.get(stage, stage.replace("_", " ")), f"{parts.show(value, 3)} {unit}", bar])
-    return f"<h2>Time</h2>{parts.table(['', '', ''], rows)}"
+        if value is not None:
+            rows.append([STAGES.get(stage, stage.replace("_", " ")), f"{parts.show(value, 3)} {unit}"])
+    return f"<h2>Time</h2>{parts.table(['', ''], rows)}"
 
 
 def _map_table(maps):

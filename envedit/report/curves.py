@@ -24,8 +24,8 @@ _NOT_LOSSES = ("iteration", "lr", "step_ms")
 def curves_svg(rows: list[dict]) -> str:
     """Draw every loss column of a history on a logarithmic axis against the iteration, as an SVG element.
 
-    A value that is missing, not finite, zero or negative interrupts its line. An empty string where there is
-    nothing to draw. Losses that are in units of a ``sigma`` which changes from row to row cannot be compared:
+    Values that are missing, not finite, zero or negative are left out. An empty string where there is nothing
+    to draw. Losses that are in units of a ``sigma`` which changes from row to row cannot be compared:
     ``residual`` is drawn in their place.
     """
     series = _series(rows)
@@ -34,7 +34,7 @@ def curves_svg(rows: list[dict]) -> str:
 
     # ---- Axes: iterations across, decimal logarithms up
     steps = [x for points in series.values() for x, _ in points]
-    values = [y for points in series.values() for _, y in points if y is not None]
+    values = [y for points in series.values() for _, y in points]
     start = min(steps)
     end = max(steps)
     high = max(values)
@@ -63,33 +63,24 @@ def curves_svg(rows: list[dict]) -> str:
     # ---- Curves, and beside them their names and last values; the total, named first, lies on top
     for i, (name, points) in reversed(list(enumerate(series.items()))):
         colour = PALETTE[i % len(PALETTE)]
-        path = ""
-        pen = "M"
-        for x, y in points:
-            if y is not None:  # h0 makes a lone point visible
-                path += f"{pen}{across(x):.1f} {down(y):.1f}{'h0' if pen == 'M' else ''}"
-            pen = "M" if y is None else "L"
-        last = next(y for _, y in reversed(points) if y is not None)
-        total = ' class="total"' if name in ("loss", "total", "residual") else ""
-        drawn.append(f'<path{total} stroke="{colour}" d="{path}"/>')
-        label = f"{escape(name[:LABEL_CHARACTERS])} {_value(last)}"
+        line = " ".join(f"{across(x):.1f},{down(y):.1f}" for x, y in points)
+        total = ' class="total"' if name in ("loss", "residual") else ""
+        drawn.append(f'<polyline{total} stroke="{colour}" points="{line}"/>')
+        label = f"{escape(name[:LABEL_CHARACTERS])} {_value(points[-1][1])}"
         drawn.append(f'<text x="{right + 16}" y="{top + 10 + 21 * i}" fill="{colour}">{label}</text>')
     return "\n".join([*drawn, "</svg>"])
 
 
 def _series(rows):
-    """Return the (iteration, decimal logarithm or None) of each loss, by its name."""
+    """Return the (iteration, decimal logarithm) of each positive value of each loss, by its name."""
     names = [name for name in columns(rows) if name not in _NOT_LOSSES]
     if {"sigma", "residual"} <= set(names):
         names = ["residual"]
     series = {}
     for name in names:
-        points = []
-        for i, row in enumerate(rows):
-            step = number(row.get("iteration", i))
-            value = number(row.get(name))
-            points.append((i if step is None else step, math.log10(value) if value and value > 0 else None))
-        if any(y is not None for _, y in points):
+        values = [(row.get("iteration", i), number(row.get(name))) for i, row in enumerate(rows)]
+        points = [(step, math.log10(value)) for step, value in values if value and value > 0]
+        if points:
             series[name] = points
     return series
 

@@ -45,9 +45,9 @@ th:first-child, td:first-child { text-align: left; padding-left: 0; }
 tbody tr td { border-top: 1px solid var(--line); }
 svg.curves { width: 100%; font-size: 12px; fill: var(--soft); }
 svg.curves, pre { background: #fff; border: 1px solid var(--line); border-radius: 3px; }
-svg.curves path { fill: none; stroke-width: 1.4; stroke-linecap: round; stroke-linejoin: round; }
-svg.curves path.total { stroke-width: 2.4; }
-svg.curves path.grid { stroke: var(--line); }
+svg.curves polyline { fill: none; stroke-width: 1.4; stroke-linejoin: round; }
+svg.curves polyline.total { stroke-width: 2.4; }
+svg.curves path.grid { stroke: var(--line); fill: none; }
 pre { padding: .9rem; font-size: .8rem; white-space: pre-wrap; }
 summary { cursor: pointer; }
 @media (max-width: 640px) { .grid { grid-template-columns: 1fr !important; } }

@@ -20,9 +20,6 @@ from tests.oracles.builders import LIGHT, write_scene
 from tests.oracles.painting import OF_TWO, SMALL, TWO_VIEWS, asked, connected, heard, painted, send, served
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("own_core")]
-pytest.importorskip("starlette", reason="the extra envedit[paint] is not installed")
-pytest.importorskip("uvicorn", reason="the extra envedit[paint] is not installed")
-pytest.importorskip("websockets", reason="the extra envedit[paint] is not installed")
 
 
 def sizes_shown(server, views=1):

@@ -25,8 +25,6 @@ from tests.oracles.painting import OF_TWO, SMALL, TWO_VIEWS, photographed, serve
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("own_core")]
 sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-pytest.importorskip("starlette", reason="the extra envedit[paint] is not installed")
-pytest.importorskip("uvicorn", reason="the extra envedit[paint] is not installed")
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 FIREFOX = os.environ.get("ENVEDIT_BROWSER") == "firefox"
 

@@ -21,8 +21,6 @@ from tests.oracles import ROOT
 from tests.oracles.painting import SMALL, asked, connected, heard, painted, send, served, until
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("own_core")]
-pytest.importorskip("starlette", reason="the extra envedit[paint] is not installed")
-pytest.importorskip("uvicorn", reason="the extra envedit[paint] is not installed")
 client = pytest.importorskip("websockets.sync.client", reason="the extra envedit[paint] is not installed")
 exceptions = pytest.importorskip("websockets.exceptions")
 

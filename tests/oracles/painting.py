@@ -9,6 +9,8 @@ import urllib.error
 import urllib.request
 from unittest import mock
 
+import pytest
+
 SMALL = """
 seed = 3
 [input]
@@ -68,8 +70,9 @@ OF_TWO = SMALL.replace('file = "sphere"\nwidth = 48', 'file = "scene.xml"\nwidth
 @contextlib.contextmanager
 def served(name, **more):
     """Serve a configuration until the block ends, with few samples of what is shown; yields the server."""
-    import uvicorn
-
+    for module in ("starlette", "websockets"):
+        pytest.importorskip(module, reason="the extra envedit[paint] is not installed")
+    uvicorn = pytest.importorskip("uvicorn", reason="the extra envedit[paint] is not installed")
     from envedit.cli.paint import project, session, settings
     from envedit.cli.paint.server import Server
 

@@ -381,18 +381,26 @@ class _Edit:
         return rendered(self.scene, envmap, spp, self.seeds.judged, cache, self.samples)[0]
 
     def render_variants(self):
-        """Render the other explanations of paint."""
+        """Render the other explanations of paint, and measure how far they follow it."""
+        target, tonemap = self.target, self.settings.output.tonemap
+        seen = None if self.scene.alpha is None else self.scene.alpha > 0
         for explanation in self.start.layers.others if self.job else ():
             with self.clock("judge_s"):
                 self.watch.stage("rendering other explanations")
                 changed, _ = self._adjusted(self.start.layers.map_of(explanation))
-                stored = self.map.as_stored(changed, self.degrees)
-                tonemap = self.settings.output.tonemap
-                self.others.append(
-                    variants.rendered(
-                        explanation, changed, stored, self.scene, self.target, tonemap, self.seeds.judged
-                    )
+                render = self.scene.render(changed, variants.SPP, self.seeds.judged)
+                followed = metrics.painted(
+                    render, target.picture, target.initial, target.coverage, tonemap, seen
                 )
+                variant = variants.Variant(
+                    name=explanation.name,
+                    evidence=explanation.score,
+                    envmap=self.map.as_stored(changed, self.degrees),
+                    render=render,
+                    run=explanation.run,
+                    **followed,
+                )
+                self.others.append(variant)
 
     def measure(self):
         """Set the metrics: how good renderings and map are, and what the solver did."""

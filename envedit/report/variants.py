@@ -9,17 +9,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from envedit import config, inputs
 from envedit.core.atomic_files import make_folder, write_atomically
-from envedit.losses import metrics
 from envedit.report import map_files, preview
-from envedit.scene.scene import Scene
 from envedit.solve import checkpoint, gauss_newton
-from envedit.solve.search import Explanation
 
 FOLDER, SHEET = "variants", "variants.png"
 """Where they are written in a run's folder, and what shows them beside each other."""
@@ -52,32 +48,6 @@ class Variant:
     def measures(self) -> dict:
         """What metrics.json has of it."""
         return {key: getattr(self, key) for key in ("name", "evidence", "towards", "elsewhere")}
-
-
-def rendered(
-    explanation: Explanation,
-    edited: np.ndarray,
-    stored: np.ndarray,
-    scene: Scene,
-    target: Any,
-    tonemap: str,
-    seed: int,
-) -> Variant:
-    """Render an explanation of paint, and measure how far it follows ``target``.
-
-    Its map (H, W, 3) is ``edited``, the radiance that reaches the scene, and ``stored``, in the units of its
-    file.
-    """
-    render = scene.render(edited, SPP, seed)
-    seen = None if scene.alpha is None else scene.alpha > 0
-    return Variant(
-        name=explanation.name,
-        evidence=explanation.score,
-        envmap=stored,
-        render=render,
-        run=explanation.run,
-        **metrics.painted(render, target.picture, target.initial, target.coverage, tonemap, seen),
-    )
 
 
 def write(

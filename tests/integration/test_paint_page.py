@@ -123,6 +123,8 @@ def opened(browser, file, made=None):
     """Open the page of a painting, which has no fault by the end; yields page, server and what is kept."""
     with served(file) as server:
         page = Page(browser, server.url, made)
+        page.page.wait_for_function("() => envedit.log.some((e) => e.frame)")
+        sync_api.expect(page.get("handle-1")).to_be_visible()
         yield page, server, file.parent / "edit_out" / "painted.toml"
         assert not page.faults, page.faults
 
@@ -169,7 +171,6 @@ def test_paint_drag_undo_save_and_reopen(browser, file):
 
 def test_another_explanation_is_chosen(browser, file):
     with opened(browser, file) as (page, *_):
-        sync_api.expect(page.get("handle-1")).to_be_visible(timeout=120_000)
         holder = page.get("explanations")
         sync_api.expect(holder).to_be_hidden()
         page.get("tool-erase-shadow").click()
@@ -187,8 +188,6 @@ def test_another_explanation_is_chosen(browser, file):
 
 def test_a_shadow_is_dragged_and_what_goes_along_is_chosen(browser, file):
     with opened(browser, file) as (page, server, kept):
-        sync_api.expect(page.get("handle-1")).to_be_visible(timeout=120_000)
-        page.page.wait_for_function("() => envedit.log.some((e) => e.frame)")
         # ---- A shadow, by its tip; and where there is none; a drag is one step, however late answers come
         answered = server.worker.session.pick
         server.worker.session.pick = lambda asked: (time.sleep(0.4), answered(asked))
@@ -289,8 +288,6 @@ def test_lights_are_placed_by_clicks_and_shaped(browser, file, tmp_path, here):
         def lights():
             return config.load(kept).input.lights if kept.exists() else ()
 
-        sync_api.expect(page.get("handle-1")).to_be_visible(timeout=120_000)
-        page.page.wait_for_function("() => envedit.log.some((e) => e.frame)")
         message = page.get("message")
         # ---- One new light by a drag, which is chosen then; why it cannot move; the same behind the ball
         page.page.keyboard.press("i")
@@ -577,8 +574,6 @@ def test_views_as_tabs_names_focus_order_and_contrast(browser, tmp_path):
     (tmp_path / "edit.toml").write_text(OF_TWO)
     with opened(browser, tmp_path / "edit.toml") as (page, _, kept):
         tabs = page.page.get_by_role("tab")
-        sync_api.expect(tabs.nth(0)).to_be_visible(timeout=120_000)
-        page.page.wait_for_function("() => envedit.log.some((e) => e.frame)")
         assert tabs.all_inner_texts() == ["front", "behind"]
         ratio = "() => document.querySelector('#render').getBoundingClientRect()"
         first = page.page.evaluate(ratio)
@@ -631,7 +626,6 @@ def test_a_photograph_is_compared_with_the_rendering(browser, tmp_path):
 def test_fingers_paint_and_zoom_on_a_tablet(browser, file):
     context = browser.new_context(viewport={"width": 820, "height": 1180}, has_touch=True)
     with opened(browser, file, context.new_page()) as (page, _, kept):
-        sync_api.expect(page.get("handle-1")).to_be_visible(timeout=120_000)
         touch = context.new_cdp_session(page.page)
 
         def fingers(kind, *places):

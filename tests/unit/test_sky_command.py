@@ -78,7 +78,7 @@ PLACE = ["--place", "47", "8"]
     ([*PLACE, "--date", "1066-10-14T12:00Z"], "got year 1066, expected 1800 to 2200"),
     ([*PLACE, "--date", "2026-06-21T23:30Z"], "below the horizon there and then"),
     (["--place", "91", "8", "--date", "2026-06-21T12:00Z"], "got 91 8, expected a latitude from -90 to 90"),
-    (["--elevation", "30", "--width", "7"], "width: got 7, expected an even integer"),
+    (["--elevation", "30", "--width", "7"], "envedit: --width: got 7, expected an even integer"),
 ])  # fmt: skip
 def test_bad_options_are_one_line(options, says, tmp_path, capsys, here):
     assert sky.main(options) == 2

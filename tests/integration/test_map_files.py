@@ -7,16 +7,14 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from envedit import config, inputs
 from envedit.core import latlong
 from envedit.core.errors import NumericalError
 from envedit.export import light_list
 from envedit.images import images
 from envedit.maps import looks
-from envedit.report import map_files
 from envedit.representations.layers.separation import separate
 from tests.oracles import users_scenes
-from tests.oracles.builders import BALL, sky
+from tests.oracles.builders import BALL
 from tests.oracles.runs import TINY, as_toml, call, changed, content, measured, pixels, small_world
 from tests.oracles.users_scenes import FLOOR, HIDDEN, LAMP, SEEN, TURN, light
 
@@ -138,17 +136,6 @@ def test_radiance_files_hold_every_exponent_to_a_256th(width, tmp_path, rng):
         images.write_hdr(tmp_path / "b.hdr", np.full((3, 6, 3), np.nan))
 
 
-def test_half_is_cut_at_its_largest_and_says_so(tmp_path, rng):
-    image = sky(rng)
-    image[2, 3] = 1e6
-    given = inputs.InputMap("a.hdr", image, 1.0, (16, 8), [])
-    said = map_files.write_map(config.Output(half=True), tmp_path / "edited", image, given)
-    np.testing.assert_allclose(
-        pixels(tmp_path / "edited.exr"), np.minimum(image, 65504), rtol=2**-11, atol=1e-7
-    )
-    assert "1 texel is brighter than 65504" in said[0]
-
-
 @pytest.mark.slow
 def test_a_run_writes_the_format_that_is_asked_for(tmp_path):
     parts = (users_scenes.PATH, users_scenes.SENSOR, BALL, light(2))
@@ -164,25 +151,3 @@ def test_a_run_writes_the_format_that_is_asked_for(tmp_path):
 
 
 # ---- where other programs look a direction up --------------------------------------------------------------
-
-
-def test_texels_are_where_the_documentation_says_that_other_programs_have_them():
-    """docs/pipelines.md: u and v of a direction, by each program's formula, after the axes are renamed."""
-    d = latlong.directions(64, 128).reshape(-1, 3)
-    d = d[np.abs(d[:, 1]) < 0.99]
-    x, y, z = d.T
-    row, column = latlong.texel_position(d, 64, 128)
-    u, v = (column + 0.5) / 128, row / 63
-    blender = z, x, y  # z up
-    three = z, y, -x  # y up
-    found = {
-        "OpenEXR, USD": ((np.pi - np.arctan2(x, z)) / (2 * np.pi), (np.pi / 2 - np.arcsin(y)) / np.pi),
-        "Blender": (
-            0.5 - np.arctan2(blender[1], blender[0]) / (2 * np.pi),
-            0.5 - np.arctan2(blender[2], np.hypot(*blender[:2])) / np.pi,
-        ),
-        "three.js": (np.arctan2(three[2], three[0]) / (2 * np.pi) + 0.5, 0.5 - np.arcsin(three[1]) / np.pi),
-    }
-    for name, (s, t) in found.items():
-        assert np.abs((s - u + 0.5) % 1 - 0.5).max() < 1e-6, name
-        np.testing.assert_allclose(t, v, atol=1e-6, err_msg=name)

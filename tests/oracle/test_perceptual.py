@@ -59,52 +59,28 @@ def lpips(backbones, folder):
     return {kind: Lpips(kind, backbones[kind], folder / f"{kind}.npz") for kind in KINDS}
 
 
-def pulled(backbone, pooling, x, directions):
-    """Taps of a double precision image, and its gradient of the sum of taps times directions."""
-    stack = backbone.stack(*x.shape[:2], pooling)
-    tape = stack.forward(double(x).array)
-    taps = [np.array(t).reshape(n, c) for t, n, c in stack.taps(tape)]
-    if directions is None:
-        return taps, None
-    back = stack.backward(tape, [mi.Float64(d.ravel()) for d in directions])
-    return taps, np.array(back).reshape(x.shape)
-
-
 # ---- features ----------------------------------------------------------------------------------------------
 
-LAYOUTS = [("vgg", "max", (21, 18)), ("vgg", "hanning", (9, 14)), ("alex", "max", (47, 36))]
-
 
 @pytest.mark.slow
-def test_features_pull_back_what_they_push_forward(backbones, rng):
-    """The sum of taps times directions, and its gradient, against a central difference."""
-    kind, pooling, size = LAYOUTS[1]
-    x, step = rng.normal(size=(*size, 3)), rng.normal(size=(*size, 3))
-    taps, _ = pulled(backbones[kind], pooling, x, None)
-    directions = [rng.normal(size=t.shape) / t.size**0.5 for t in taps]
-    _, back = pulled(backbones[kind], pooling, x, directions)
-    h, ends = 1e-7, []
-    for sign in (1, -1):
-        taps, _ = pulled(backbones[kind], pooling, x + sign * h * step, None)
-        ends.append(sum(np.sum(t * d) for t, d in zip(taps, directions, strict=True)))
-    expected = (ends[0] - ends[1]) / (2 * h)
-    assert np.sum(back * step) == pytest.approx(expected, rel=1e-5)
+@pytest.mark.parametrize(
+    ("kind", "pooling", "size"), [("vgg", "hanning", (9, 14)), ("alex", "max", (47, 36))]
+)
+def test_features_in_bands_are_the_same(kind, pooling, size, backbones, monkeypatch, rng):
+    """Taps in double precision, and the gradient of the sum of taps times directions."""
+    stack = backbones[kind].stack(*size, pooling)
+    x = double(rng.normal(size=(*size, 3))).array
+    directions = [mi.Float64(rng.normal(size=n * c)) for _, n, c in stack.taps(stack.forward(x))]
 
+    def found(most):
+        monkeypatch.setattr(convolution, "MOST_PATCHES", most)
+        stack = backbones[kind].stack(*size, pooling)
+        tape = stack.forward(x)
+        back = [stack.backward(tape, directions)] if pooling == "hanning" else []
+        return [np.array(one) for one in (*(tap for tap, _, _ in stack.taps(tape)), *back)]
 
-@pytest.mark.slow
-def test_features_in_bands_are_the_same(backbones, monkeypatch, rng):
-    for kind, pooling, size in (LAYOUTS[1], LAYOUTS[2]):
-        x = rng.normal(size=(*size, 3))
-        taps, _ = pulled(backbones[kind], pooling, x, None)
-        directions = [rng.normal(size=t.shape) for t in taps] if pooling == "hanning" else None
-        whole = pulled(backbones[kind], pooling, x, directions)
-        monkeypatch.setattr(convolution, "MOST_PATCHES", 2**14)  # bands of one to a few rows
-        bands = pulled(backbones[kind], pooling, x, directions)
-        monkeypatch.undo()
-        for a, b in zip(whole[0], bands[0], strict=True):
-            np.testing.assert_allclose(b, a, rtol=1e-11, atol=1e-13)
-        if directions:
-            np.testing.assert_allclose(bands[1], whole[1], rtol=1e-10, atol=1e-11)
+    for bands, whole in zip(found(2**14), found(2**24), strict=True):  # of one to a few rows
+        np.testing.assert_allclose(bands, whole, rtol=1e-10, atol=1e-11)
 
 
 def test_max_pooling_does_not_lose_nan():
@@ -123,8 +99,9 @@ def test_least_sizes(backbones):
     assert least == {"vgg": 16, "alex": 31}
     assert backbones["vgg"].least_size("hanning") == 1
     for kind, n in least.items():
-        taps, _ = pulled(backbones[kind], "max", np.ones((n, n, 3)), None)
-        assert len(taps[-1]) >= 1 and np.isfinite(taps[-1]).all()
+        stack = backbones[kind].stack(n, n)
+        last, pixels, _ = stack.taps(stack.forward(dr.ones(mi.Float, n * n * 3)))[-1]
+        assert pixels >= 1 and np.isfinite(last).all()
 
 
 # ---- recorded numbers --------------------------------------------------------------------------------------
@@ -180,17 +157,6 @@ def test_trained_networks_score_as_the_authors_programs(data):
 
 
 # ---- the measures ------------------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_gradient_against_differences(dists):
-    x, y, directions = drawn.images(31, 33)
-    against = dists.against(double(y))
-    _, slope = gradient(against, double(x))
-    h = 1e-8  # with 1e-6 a step crosses the kinks of some ReLU
-    for step in directions[:2]:
-        ends = [against(double(x + s * h * step))[0] for s in (1, -1)]
-        assert np.sum(slope * step) == pytest.approx((ends[0] - ends[1]) / (2 * h), rel=2e-5)
 
 
 @pytest.mark.slow

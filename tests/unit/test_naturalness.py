@@ -51,15 +51,6 @@ def test_a_dark_bump_is_a_patch_of_its_size(width, rng):
         assert found == pytest.approx(expected, rel=0.1)
 
 
-def test_a_gradient_over_the_whole_sky_is_less_than_patches_of_the_same_size():
-    east, d = DIRECTIONS[..., 0], DIRECTIONS.reshape(-1, 3)
-    patchy = np.cos(np.radians(360 / 40) * np.degrees(np.arctan2(d[:, 0], -d[:, 2]))).reshape(GRID)
-    sizes = [np.sqrt((OMEGA * f[:HALF] ** 2).sum() / OMEGA.sum()) for f in (east, patchy)]
-    changes = [-0.3 * f / size for f, size in zip((east, patchy), sizes, strict=True)]
-    found = [naturalness.patches(grey(change), grey(np.zeros(GRID))) for change in changes]
-    assert found[0] < 0.75 * found[1]
-
-
 @pytest.mark.parametrize("clouds", [0.0, 0.2])
 def test_the_sun_elsewhere_is_no_patch(clouds, rng):
     """Its texels are cut, where it was and where it is; a bright patch that is no sun is not."""

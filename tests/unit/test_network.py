@@ -5,7 +5,6 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from envedit.core import latlong
 from envedit.representations.siren import network as siren
 from tests.oracles.kernels import own
 from tests.oracles.plain import numpy_forward
@@ -88,14 +87,6 @@ def test_gradient_is_that_of_automatic_differentiation(depth, hidden, rng):
     assert differ(ours(params, x, own(weight)), expected) == list(params)
 
 
-@pytest.mark.parametrize("depth", [0, 3])
-def test_network_of_directions_has_three_inputs(depth, rng):
-    params, x, weight = siren.init(0, 9, depth, inputs=3), siren.directions(6, 9), rng.normal(size=(54, 3))
-    y, _ = siren.forward(params, x, OMEGA)
-    np.testing.assert_allclose(y.numpy(), numpy_forward(arrays(params), x.numpy(), OMEGA), atol=2e-5)
-    assert differ(ours(params, x, own(weight)), gradient(plain_forward, params, x, own(weight))) == []
-
-
 @pytest.mark.parametrize("count", slow_but(POINTS, 1, 7, 1023))
 @pytest.mark.parametrize(("hidden", "depth"), [(7, 7), (129, 1)])
 def test_gradient_counts_every_point_once(count, hidden, depth, rng):
@@ -153,32 +144,3 @@ def test_initial_weights_are_uniform_within_the_published_bounds():
             # Variance of U(-1, 1) is 1/3, its own standard error sqrt(4/45 / n): 4.5 sigma is 1 in 150 000.
             assert abs(np.var(values) - 1 / 3) < 4.5 * np.sqrt(4 / 45 / values.size)
             assert abs(values.mean()) < 4.5 * np.sqrt(1 / 3 / values.size)
-
-
-@pytest.mark.parametrize(("height", "width"), [(1, 1), (2, 4), (5, 9)])
-def test_coordinates_are_texel_centres(height, width):
-    x = siren.coordinates(height, width).numpy()
-    assert x.shape == (height * width, 2)
-    for texel in range(height * width):
-        row, column = divmod(texel, width)
-        expected = [(row + 0.5) / height * 2 - 1, (column + 0.5) / width * 2 - 1]
-        np.testing.assert_allclose(x[texel], expected, atol=1e-7)
-
-
-@pytest.mark.parametrize(("height", "width", "rows"), [
-    (1, 1, ()), (4, 8, ()), (5, 9, (0, 5)), (2, 6, (0, 9)), (3, 8, (4, 7)), (1, 5, (2, 3)),
-])  # fmt: skip
-def test_directions_point_through_the_texels_of_their_rows(height, width, rows):
-    x = siren.directions(height, width, *rows)
-    assert isinstance(x, mi.TensorXf) and x.shape == (height * width, 3)
-    first, total = rows or (0, height)
-    unit = np.float64(x.numpy()).reshape(height, width, 3) / siren.SPHERE_SCALE
-    np.testing.assert_allclose(np.linalg.norm(unit, axis=-1), 1, atol=1e-6)
-    np.testing.assert_allclose(unit, latlong.directions(total, width)[first : first + height], atol=1e-6)
-    row, column = latlong.texel_position(unit, total, width)
-    if total > 1:  # the one row of a map is its equator
-        np.testing.assert_allclose(row, np.broadcast_to(np.arange(first, first + height)[:, None], row.shape),
-                                   atol=1e-5)  # fmt: skip
-    inner = (row > 0.5) & (row < total - 1.5)  # at a pole every column is the same point
-    expected = np.broadcast_to(np.arange(width), column.shape)
-    np.testing.assert_allclose(column[inner], expected[inner], atol=1e-5)

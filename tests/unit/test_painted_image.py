@@ -7,11 +7,11 @@ import mitsuba as mi
 import numpy as np
 import OpenEXR
 import pytest
+from numpy.lib.stride_tricks import sliding_window_view
 
 from envedit import config
 from envedit.core.color import TONEMAPS, tonemap
 from envedit.core.errors import InputError
-from envedit.core.seeds import Seeds
 from envedit.images import images
 from envedit.targets import initial_rendering, painted_image
 from tests.oracles.builders import chunk, exr, floats, png, with_chunk
@@ -94,7 +94,9 @@ def test_exactly_the_rectangle_is_painted(kind, name, initial, tmp_path):
 @pytest.mark.parametrize("quality", [80, 90, 95, 100])
 def test_paint_is_found_in_a_jpeg(quality, initial, tmp_path):
     wanted, where = brushed(initial)
-    found = painted_image.read(jpeg(tmp_path / "p.jpg", codes(wanted), quality), SIZE, "gamma", initial)
+    file = jpeg(tmp_path / "p.jpg", codes(wanted), quality)
+    assert abs(images.read_stored(file)[1]["quality"] - quality) <= 1
+    found = painted_image.read(file, SIZE, "gamma", initial)
     np.testing.assert_array_equal(found.coverage[..., 0] > 0, where)
     assert found.picture[~where].tobytes() == initial[~where].tobytes()
     error = np.abs(tonemap(found.picture[where]) - tonemap(wanted[where]))
@@ -111,35 +113,19 @@ def test_paint_is_found_where_colours_are_subsampled(quality, initial, tmp_path)
     assert (found & ~where).sum() + (where & ~found).sum() <= 12
 
 
-@pytest.mark.parametrize("quality", [75, 90])
-def test_ringing_beside_strong_paint_is_no_paint(quality, initial, tmp_path):
-    initial = initial.clip(0.2, 0.3)
+@pytest.mark.parametrize(("colour", "low", "high", "quality", "bleeds"), [
+    (230, 0.2, 0.3, 75, 0), (230, 0.2, 0.3, 90, 0), ([250, 120, 10], 0, 0.5, 85, 1),
+    ([250, 120, 10], 0, 0.5, 95, 1),
+])  # fmt: skip
+def test_strong_paint_rings_and_bleeds_by_a_pixel(colour, low, high, quality, bleeds, initial, tmp_path):
+    initial = initial.clip(low, high)
     wanted, where = codes(initial), np.zeros(SIZE, bool)
     for part in (np.s_[13:21, 21:50], np.s_[27:43, 30:44]):
-        wanted[part], where[part] = 230, True
-    found = painted_image.read(jpeg(tmp_path / "p.jpg", wanted, quality), SIZE, "gamma", initial)
-    np.testing.assert_array_equal(found.coverage[..., 0] > 0, where)
-
-
-@pytest.mark.parametrize("quality", [85, 95])
-def test_strong_colours_bleed_by_one_pixel_at_most(quality, initial, tmp_path):
-    wanted, where = codes(initial.clip(0, 0.5)), np.zeros(SIZE, bool)
-    for part in (np.s_[13:21, 21:50], np.s_[27:43, 30:44]):
-        wanted[part], where[part] = [250, 120, 10], True
+        wanted[part], where[part] = colour, True
     file = jpeg(tmp_path / "p.jpg", wanted, quality)
-    found = painted_image.read(file, SIZE, "gamma", initial.clip(0, 0.5)).coverage[..., 0] > 0
-    around = where.copy()
-    for step in (1, -1):
-        around |= np.roll(where, step, 0) | np.roll(where, step, 1)
-    for step in (1, -1):
-        around |= np.roll(around, step, 1) & np.roll(around, step, 0)
-    assert not found[~around].any() and found[where].mean() > 0.98
-
-
-@pytest.mark.parametrize("quality", [50, 75, 90, 98])
-def test_the_quality_of_a_jpeg_is_known(quality, initial, tmp_path):
-    _, info = images.read_stored(jpeg(tmp_path / "p.jpg", codes(initial), quality))
-    assert abs(info["quality"] - quality) <= 1
+    found = painted_image.read(file, SIZE, "gamma", initial).coverage[..., 0] > 0
+    near = sliding_window_view(np.pad(where, bleeds), (1 + 2 * bleeds, 1 + 2 * bleeds)).any(axis=(2, 3))
+    assert not found[~near].any() and found[where].mean() > (0.98 if bleeds else 0.9999)
 
 
 @pytest.mark.parametrize("quality", [75, 95])
@@ -149,18 +135,6 @@ def test_a_colourful_rendering_without_paint_is_refused(quality, tmp_path):
     initial[:, (np.arange(83) // 3) % 2 == 0] = [0.6, 0.1, 0.3]  # stripes that subsampled colours mix
     pillow.fromarray(codes(initial)).save(tmp_path / "p.jpg", quality=quality, subsampling=2)
     refused(["nothing of it is painted"], tmp_path / "p.jpg", SIZE, "gamma", initial)
-
-
-@pytest.mark.parametrize("kind", ["exr", "half", "png16", "png8", "jpg75", "jpg95"])
-def test_a_picture_without_paint_is_refused(kind, initial, tmp_path):
-    file = tmp_path / f"p.{kind[:3]}"
-    if kind[:3] == "jpg":
-        jpeg(file, codes(initial), int(kind[3:]))
-    elif kind[:3] == "png":
-        png(file, codes(initial, "gamma", 65535 if kind == "png16" else 255))
-    else:
-        floats(file, initial, np.float16 if kind == "half" else np.float32)
-    refused([file.name, "nothing of it is painted", "mask"], file, SIZE, "gamma", initial)
 
 
 @pytest.mark.parametrize(("top", "hidden", "shown"), [(255, 1, 2), (65535, 31, 33)])
@@ -195,14 +169,6 @@ def test_faint_radiance_is_paint_and_a_sun_that_a_half_cannot_hold_is_none(tmp_p
     wanted[4, 4] = 2
     found = painted_image.read(floats(tmp_path / "p.exr", wanted, np.float16), (8, 8), "gamma", initial)
     assert found.coverage.sum() == 1 and found.picture[1, 1, 0] == 1e6 and found.picture[4, 4, 0] == 2
-
-
-def test_one_pixel(tmp_path):
-    initial = np.full((1, 1, 3), 0.25, np.float32)
-    file = png(tmp_path / "p.png", np.full((1, 1, 3), 20, np.uint8))
-    found = painted_image.read(file, (1, 1), "gamma", initial)
-    assert found.coverage.item() == 1
-    assert "100 %" in told(found) and "another rendering" in told(found)
 
 
 # ---- tonemaps ----------------------------------------------------------------------------------------------
@@ -427,18 +393,6 @@ def test_palette_with_transparency(tmp_path):
     np.testing.assert_allclose(found.picture[0, 0] * 255, [10, 20, 30], rtol=1e-6)
 
 
-def test_interlaced(tmp_path):
-    """Adam7 of 2 x 2 pixels: passes 1, 6 and 7 hold one, one and two of them."""
-    head = struct.pack(">IIBBBBB", 2, 2, 16, 2, 0, 0, 1)
-    a, b, c, d = (np.array([n, 1000 + n, 60000 + n], ">u2").tobytes() for n in (1, 2, 3, 4))
-    rows = b"\0" + a + b"\0" + b + b"\0" + c + d
-    data = chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
-    (tmp_path / "p.png").write_bytes(b"\x89PNG\r\n\x1a\n" + data)
-    found = painted_image.read(tmp_path / "p.png", (2, 2), "linear").picture * 65535
-    np.testing.assert_allclose(found[..., 0], [[1, 2], [3, 4]], rtol=1e-6)
-    np.testing.assert_allclose(found[..., 2], [[60001, 60002], [60003, 60004]], rtol=1e-6)
-
-
 def test_cmyk_and_another_size_are_refused(initial, tmp_path):
     frame = bytes([8]) + struct.pack(">HH", *SIZE) + bytes([4]) + bytes(12)
     data = b"\xff\xd8\xff\xc0" + struct.pack(">H", len(frame) + 2) + frame
@@ -654,25 +608,8 @@ def test_texts_of_a_png_are_as_another_program_reads_them(tmp_path, rng):
     picture = rng.random((5, 7, 3))
     named = {"envedit.tonemap": "gamma", "envedit.envmap": "fjälls 空.hdr"}
     images.write_png(tmp_path / "a.png", picture, 16, named)
-    raw, at, texts = (tmp_path / "a.png").read_bytes(), 8, {}
-    while at < len(raw):
-        (length,), kind = struct.unpack(">I", raw[at : at + 4]), raw[at + 4 : at + 8]
-        body = raw[at + 8 : at + 8 + length]
-        assert struct.unpack(">I", raw[at + 8 + length : at + 12 + length])[0] == zlib.crc32(kind + body)
-        if kind == b"tEXt":
-            key, _, text = body.partition(b"\0")
-            texts[key.decode()] = text.decode("latin-1")
-        at += 12 + length
+    texts = pytest.importorskip("PIL.Image").open(tmp_path / "a.png").text
     assert texts["envedit.tonemap"] == "gamma" and texts["envedit.envmap"] == "fjälls ?.hdr"
     pixels, info = images.read_stored(tmp_path / "a.png")
     assert info["metadata"]["envedit.tonemap"] == "gamma"
     np.testing.assert_array_equal(pixels, np.rint(picture.astype(np.float32) * np.float32(65535)))
-
-
-def test_the_run_renders_the_exported_picture_again(monkeypatch):
-    """The seed is stated, and not that of a rendering that is judged."""
-    monkeypatch.setattr(
-        initial_rendering, "rendered", lambda lit, envmap, *asked: ((envmap, *asked[:2]), 0, None)
-    )
-    found = initial_rendering.initial(None, "map", settings(spp=32))
-    assert found == ("map", 32, Seeds(3).exported)

@@ -41,16 +41,12 @@ def test_pixels_give_back_every_bit_and_their_logarithms_the_map():
     assert (decoded >= 0).all()
 
 
-def test_siren_gives_back_what_was_fitted(rng):
+def test_siren_holds_what_was_fitted(rng):
     image, representation = sky(rng), make("siren")
     params = representation.encode(image, seed=4)
     fitted = fit.fit(image, representation.network, QUICK, seed=4)
     assert representation.fitted.log_psnr == fitted.log_psnr
     assert all(np.array_equal(params[name].numpy(), fitted.params[name]) for name in fitted.params)
-    decoded = representation.decode(params)
-    x = fit.points(representation.network, (8, 16))
-    expected = fit.evaluate(params, fitted.normalisation, x, (8, 16), representation.network.omega)
-    np.testing.assert_array_equal(decoded.numpy(), expected.numpy())
 
 
 def plane_points(height, width, rows):
@@ -68,8 +64,7 @@ POINTS = {"plane": plane_points, "sphere": sphere_points}
 
 @pytest.mark.parametrize("coordinates", POINTS)
 @pytest.mark.parametrize("shape, rows", [
-    ((8, 16), None), ((5, 7), None), ((8, 16), (0, 16)), ((4, 8), (0, 8)), ((8, 20), (6, 16)),
-    ((8, 16), (8, 16)),
+    ((8, 16), None), ((5, 7), None), ((1, 1), None), ((8, 16), (0, 16)), ((8, 20), (6, 16)),
 ])  # fmt: skip
 def test_siren_is_decoded_at_the_texels_of_its_rows(coordinates, shape, rows, rng):
     """The network in float64 at the texel centres, and Eq. 2-3."""
@@ -122,18 +117,6 @@ def test_gradient_is_the_finite_difference(kind, rng):
     np.testing.assert_allclose(np.sum(found * weight), (ends[0] - ends[1]) / 2e-5, rtol=1e-6)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_gradient_reaches_every_parameter(kind, rng):
-    representation = make(kind)
-    params = representation.encode(sky(rng) + np.float32(0.1))
-    leaves = {name: mi.TensorXf(value) for name, value in params.items()}
-    dr.enable_grad(leaves)
-    dr.backward(dr.sum(representation.decode(leaves).array))
-    for leaf in leaves.values():
-        gradient = np.array(dr.grad(leaf))
-        assert np.isfinite(gradient).all() and np.count_nonzero(gradient) > 0.9 * gradient.size
-
-
 @pytest.mark.parametrize("kind", ["pixels", "log-pixels"])
 @pytest.mark.parametrize("below", [0.0, 0.5])
 def test_black_texels_can_be_lit(kind, below):
@@ -146,15 +129,6 @@ def test_black_texels_can_be_lit(kind, below):
     assert (decoded.numpy() >= 0).all()
     dr.backward(dr.sum(decoded.array))
     assert (np.array(dr.grad(leaf)) > 0).all()
-
-
-def test_siren_keeps_a_fit_for_each_place_in_a_map(tmp_path, rng):
-    image, cached = sky(rng), []
-    for rows in (None, (0, 8), (0, 16), (8, 16), (8, 16)):
-        representation = make("siren", tmp_path, rows)
-        representation.encode(image)
-        cached.append(representation.fitted.cached)
-    assert cached == [False, True, False, False, True]
 
 
 def test_siren_of_another_image_forgets_the_points_of_the_first(rng):

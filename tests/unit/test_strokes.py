@@ -283,26 +283,6 @@ def test_extreme_pictures_stay_finite(name, value, size, rng):
         assert found.picture.max() > 0 or min(size) < 40  # the light
 
 
-def test_no_stroke_leaves_single_precision():
-    picture = grey(3.4e38)
-    picture[..., 2] = 0
-    light = {"type": "light", "rectangle": BOX, "amount": 1e6}
-    for stroke in ({"type": "temperature", "kelvin": 2000}, light):
-        found = strokes.paint(picture, [stroke, {"type": "contrast", "amount": 9}]).picture
-        assert np.isfinite(found).all() and found.max() > 3.3e38
-
-
-def test_a_highlight_beside_a_stroke_is_neither_cut_nor_moved():
-    picture = grey(0.3, 64, 64)
-    picture[2, 2], picture[32, 32] = 1e6, 1e6
-    for stroke in ALL:
-        found = painted(picture, **stroke)
-        assert found[2, 2, 0] == np.float32(1e6)
-    # Under a stroke of opacity 1/2 it is brought down, not cut to white.
-    assert painted(picture, **ALL[0])[32, 32, 0] == pytest.approx(4e5)
-    assert painted(picture, opacity=0.5, **ALL[2])[32, 32, 0] > 1
-
-
 def test_strokes_that_paint_nothing_say_so():
     picture = grey(0.5)
     nothing = [
@@ -330,32 +310,19 @@ DOT = "points = [[0.5, 0.5]], width = 0.1"
     ("type = 'shade'", "did you mean shadow?"),
     (f"type = 'shadow', {DOT}, widht = 1", "type shadow, has no key 'widht'; did you mean width?"),
     ("type = 'shadow'", "target.strokes[1]: got no shape, expected one of points, polygon"),
-    (f"type = 'light', {DOT}, ellipse = [0, 0, 1, 1]", "got points and ellipse, expected one shape"),
-    ("type = 'light', points = [[0, 0]]", "target.strokes[1].width: got none, expected the width"),
-    (
-        "type = 'light', points = [[0, 0]], width = 0",
-        "target.strokes[1].width: got 0, expected a number above",
-    ),
     ("type = 'blur', radius = 1, width = 1", "target.strokes[1].width: got 1, expected none without points"),
-    ("type = 'light', width = 1, points = []", "target.strokes[1].points: got [], expected [[x, y]"),
     ("type = 'light', width = 1, points = [[0, 0], [1]]", "target.strokes[1].points[1]: got [1]"),
     ("type = 'light', polygon = [[0, 0], [1, 1]]", "at least 3"),
     ("type = 'light', ellipse = [0, 0, 1]", "ellipse: got [0, 0, 1], expected [cx, cy, rx, ry] or"),
-    ("type = 'light', ellipse = [0, 0, 1, 0]", "ellipse: got [0, 0, 1, 0], expected a number above 0"),
     (
         "type = 'light', rectangle = [1, 0, 0, 1]",
         "rectangle: got [1, 0, 0, 1], expected [x0, y0, x1, y1] with",
     ),
     (f"type = 'light', {DOT}, color = [1, -1, 1]", "target.strokes[1].color: got [1, -1, 1], expected"),
     (f"type = 'light', {DOT}, color = '#ffd9a'", "[r, g, b], or a colour such as"),
-    (
-        f"type = 'light', {DOT}, amount = -1",
-        "target.strokes[1].amount: got -1, expected a number of at least 0",
-    ),
     (f"type = 'shadow', {DOT}, opacity = 2", "target.strokes[1].opacity: got 2, expected"),
     (f"type = 'shadow', {DOT}, units = 'pixel'", "units: got 'pixel', expected one of fraction, pixels; did"),
     ("type = 'temperature'", "target.strokes[1].kelvin: got none, expected a number"),
-    ("type = 'blur', radius = 0", "target.strokes[1].radius: got 0, expected a number above 0"),
 ])  # fmt: skip
 def test_a_stroke_that_cannot_be_understood_is_refused_by_name(stroke, says):
     both = f"[{{type = 'contrast', amount = 1.2}}, {{{stroke}}}]"

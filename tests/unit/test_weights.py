@@ -100,15 +100,6 @@ def test_every_truncation_is_refused(tmp_path):
         refused(tmp_path / "short")
 
 
-def test_too_little_memory_is_told(tmp_path, monkeypatch):
-    def read(*_):
-        raise MemoryError
-
-    np.savez(tmp_path / "w.npz", **values())
-    monkeypatch.setattr(weights, "_tensor", read)
-    refused(tmp_path / "w.npz", "not enough memory to read the weights of the test")
-
-
 def test_hostile_archives_are_refused(tmp_path):
     path, good = tmp_path / "w.npz", values()
 

@@ -3,9 +3,8 @@
 ``loss(x, reference)`` returns a size-1 array of the tensor's own type, differentiable in ``x``; losses of
 pictures take a ``weight`` too. Images are ``(H, W, C)`` tensors (C = 3 unless said otherwise) of any Dr.Jit
 precision; a weight is ``(H, W, 1)`` or ``(H, W, C)``, not negative. A weighted mean divides by the sum of the
-weights and is 0 where all weights are 0. Sums run in double precision: Dr.Jit's single-precision sum is off
-by 5e-5 on a megapixel sky with a sun of 1e6. A non-finite texel makes the loss non-finite, whatever its
-weight; nothing is clipped.
+weights and is 0 where all weights are 0. Sums run in double precision. A non-finite texel makes the loss
+non-finite, whatever its weight; nothing is clipped.
 """
 
 from __future__ import annotations

@@ -32,17 +32,13 @@ class Adam:
        m <- b1 m + (1 - b1) g        v <- b2 v + (1 - b2) g^2
        p <- p - lr (m / (1 - b1^t)) / (sqrt(v / (1 - b2^t)) + eps)         Kingma and Ba 2015, Algorithm 1
 
-    State and arithmetic have the precision of the parameters; bias corrections are double. A gradient
-    below 1e-19 in single precision has a square that underflows: its v stays 0; its step is ``lr m / eps``,
-    small and finite. A gradient that is not finite, or whose square is not (above 1.8e19), would leave v
-    infinite and the parameter stuck for good, and so would moments or a step that are not: such a step is
-    refused as a whole. What a step leads to is seen in the next one only: `take_back` returns to the
-    parameters before it.
+    A step is refused as a whole where a gradient, its square (above 1.8e19 in single precision), a moment or
+    a parameter would not be finite: v would stay infinite, and the parameter stuck for good. What a step
+    leads to is seen in the next one only: `take_back` returns to the parameters before it.
 
     ``params``, tensors of one precision, are starting values, which are copied: read them as
-    ``adam.params[name]``.
-    ``lr`` is that of a `step` that is not given its own, ``betas`` are the decay of the two moments, in
-    [0, 1), and ``eps`` is above 0, so that 0 / 0 cannot arise.
+    ``adam.params[name]``. ``lr`` is that of a `step` that is not given its own, ``betas`` are the decay of
+    the two moments, in [0, 1), and ``eps`` is above 0, so that 0 / 0 cannot arise.
     """
 
     def __init__(
@@ -73,8 +69,7 @@ class Adam:
     def step(self, grads: Mapping[str, Tensor], lr: float | None = None) -> bool:
         """Update all parameters in one evaluation, by a gradient for each, of its shape.
 
-        Returns whether the step was taken. It is not, and nothing has changed, if a gradient is not finite or
-        too large to square, or the step leads to parameters or moments that are not finite.
+        Returns whether the step was taken; where it is refused, nothing has changed.
         """
         lr = self.lr if lr is None else lr
         b1, b2 = self.betas

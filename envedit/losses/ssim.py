@@ -66,10 +66,8 @@ class Ssim:
     Images are display values, whose data range is 1. With ``d = x - y`` the map is ``(1 - a)(1 - b)``,
     ``a = mu_d^2 / (mu_x^2 + mu_y^2 + C1)``, ``b = var_d / (var_x + var_y + C2)``, and the loss the mean of
     ``a + b - ab``: identical images give exactly 0 and near ones keep their digits. Variances are merged from
-    columns of squared deviations, never ``E[x^2] - E[x]^2``: they are not negative and carry a relative error
-    of some 1e-6 in single precision, whatever the offset of the image; the gradient's is as much times
-    ``|x|`` over the local contrast. Squares must be representable: ``|x|`` up to 1e18 in single precision,
-    NaN beyond.
+    columns of squared deviations, never ``E[x^2] - E[x]^2``, which loses digits to the offset of the image.
+    Squares must be representable: ``|x|`` up to 1e18 in single precision, NaN beyond.
 
     The ``reference`` (H, W, C), y, is not differentiated. A ``weight``, (H, W, 1) or (H, W, C), not negative,
     is that of the window centred there; windows that cross an edge do not exist. InputError if a shape does

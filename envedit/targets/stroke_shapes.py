@@ -1,6 +1,8 @@
 """Where a stroke is: the coverage of each pixel by a shape, from its signed distance.
 
-The shapes are those of ``strokes.py``: a brush along points, a polygon, an ellipse, a rectangle.
+A brush along points is round at ends and joints, a polygon filled by the even-odd rule, and an ellipse turned
+from x towards y, which points down. In fractions x and rx are shares of the picture's width, y and ry of its
+height, and width and softness of its width; in pixels the first one's centre is at 0.5, 0.5.
 """
 
 from __future__ import annotations

@@ -1,18 +1,7 @@
 """Strokes: what an artist paints on a rendering, written down as numbers.
 
-A stroke is a dict (in TOML an inline table, or ``[[target.strokes]]``) with a ``type``, a shape and what
-belongs to the type; the keys, their defaults and their ranges are :data:`.stroke_schema.STROKES`.
-
-Shapes, one a stroke; none is the whole image and goes with temperature, contrast and blur:
-
-- ``points = [[x, y], ...]`` and ``width``: a brush drawn along them, round at ends and joints;
-- ``polygon = [[x, y], ...]``: filled, inside by the even-odd rule;
-- ``ellipse = [cx, cy, rx, ry]`` or ``[cx, cy, rx, ry, degrees]``, turned from x towards y (y points down);
-- ``rectangle = [x0, y0, x1, y1]``.
-
-``units = "fraction"``: x and rx are shares of the picture's width, y and ry of its height; width, softness
-and radius are shares of its width. ``units = "pixels"``: all in pixels, the first one's centre at 0.5, 0.5.
-``softness`` is the width of the soft edge, half of it outside the shape; ``opacity`` scales what is done.
+A stroke is a dict with a ``type``, a shape (:mod:`.stroke_shapes`; none is the whole image) and what belongs to
+the type; the keys, their defaults and ranges are :data:`.stroke_schema.STROKES`.
 
 With E linear radiance, c coverage times opacity, t = D(E) display values:
 
@@ -34,7 +23,7 @@ D is the named tonemap up to display white and a logarithm above it (:class:`Dis
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -43,8 +32,6 @@ import numpy as np
 from envedit.config.stroke_schema import StrokeList
 from envedit.core.color import inverse_tonemap, luminance, tonemap
 from envedit.targets.stroke_shapes import coverage
-
-__all__ = ["Painted", "paint"]
 
 _MOST = float(np.finfo(np.float32).max)
 
@@ -91,9 +78,10 @@ def paint(picture: np.ndarray, strokes: Sequence[dict], tonemap: str = "gamma") 
         if stroke["type"] == "erase-shadow" and covered.all():
             warnings.append(f"{name}: covers the whole picture, no surroundings to paint with are left")
             continue
-        operation, on_display = _OPERATIONS[stroke["type"]]
+        on_display = stroke["type"] in ON_DISPLAY
         values = display.show(result) if on_display else result
-        painted = values + covered * stroke["opacity"] * (operation(values, covered, stroke) - values)
+        change = _at_full_strength(values, covered, stroke) - values
+        painted = values + covered * stroke["opacity"] * change
         painted = display.radiance(painted) if on_display else painted
         result = np.where(covered > 0, np.minimum(painted, _MOST), result)
         bare *= 1 - covered
@@ -102,8 +90,7 @@ def paint(picture: np.ndarray, strokes: Sequence[dict], tonemap: str = "gamma") 
     return Painted(picture, total, warnings=tuple(warnings))
 
 
-# ------------------------------------------------------------------------------------------------------------
-# Display values
+# ---- Display values ----------------------------------------------------------------------------------------
 
 
 class Display:
@@ -131,54 +118,34 @@ class Display:
         return inverse_tonemap(values, self.name) * above
 
 
-# ------------------------------------------------------------------------------------------------------------
-# What: operations, values (h, w, 3) and coverage (h, w, 1) -> values at full strength
+# ---- What: values (h, w, 3) of the covered pixels at full strength -----------------------------------------
+
+ON_DISPLAY = ("erase-shadow", "contrast", "blur")
+"""Types of strokes that work on display values, the others on radiance."""
 
 
-def _shadow(radiance, covered, stroke):
-    return radiance * ((1 - stroke["amount"]) * np.array(stroke["color"]))
-
-
-def _light(radiance, covered, stroke):
-    return radiance + stroke["amount"] * np.array(stroke["color"])
-
-
-def _erase_shadow(values, covered, stroke):
-    return membrane(values, covered[..., 0] > 0)
-
-
-def _temperature(radiance, covered, stroke):
-    gain = gains(stroke["kelvin"])
-    mean = (covered * radiance).sum(axis=(0, 1)) / covered.sum()
-    before, after = float(luminance(mean)), float(luminance(gain * mean))
-    return radiance * gain * (before / after if before > 0 and after > 0 else 1.0)
-
-
-def _contrast(values, covered, stroke):
+def _at_full_strength(values, covered, stroke):
+    """Return what a stroke makes of values (h, w, 3); ``covered`` (h, w, 1) is its coverage."""
     mean = (covered * values).sum(axis=(0, 1)) / covered.sum()
-    # A highlight is left where it is: beyond white, a factor on display values is a power of radiance.
-    return np.clip(mean + stroke["amount"] * (values - mean), 0, np.maximum(np.maximum(values, mean), 1))
-
-
-def _blur(values, covered, stroke):
-    sigma = stroke["radius"] * (values.shape[1] if stroke["units"] == "fraction" else 1)
-    return _blurred(_blurred(values, sigma, 0), sigma, 1)
-
-
-def _hold(values, covered, stroke):
-    return values
-
-
-_OPERATIONS: dict[str, tuple[Callable, bool]] = {
-    "shadow": (_shadow, False),
-    "light": (_light, False),
-    "erase-shadow": (_erase_shadow, True),
-    "temperature": (_temperature, False),
-    "contrast": (_contrast, True),
-    "blur": (_blur, True),
-    "hold": (_hold, False),
-}
-"""What each type of stroke does, and whether it does it to display values."""
+    match stroke["type"]:
+        case "shadow":
+            return values * ((1 - stroke["amount"]) * np.array(stroke["color"]))
+        case "light":
+            return values + stroke["amount"] * np.array(stroke["color"])
+        case "erase-shadow":
+            return membrane(values, covered[..., 0] > 0)
+        case "temperature":
+            gain = gains(stroke["kelvin"])
+            before, after = float(luminance(mean)), float(luminance(gain * mean))
+            return values * gain * (before / after if before > 0 and after > 0 else 1.0)
+        case "contrast":
+            # A highlight stays: beyond white, a factor on display values is a power of radiance.
+            changed = mean + stroke["amount"] * (values - mean)
+            return np.clip(changed, 0, np.maximum(np.maximum(values, mean), 1))
+        case "blur":
+            sigma = stroke["radius"] * (values.shape[1] if stroke["units"] == "fraction" else 1)
+            return _blurred(_blurred(values, sigma, 0), sigma, 1)
+    return values  # hold
 
 
 def gains(kelvin: float) -> np.ndarray:

@@ -165,13 +165,12 @@ def _of_paint(settings, scene, envmap, picture, mask, hidden):
     # ---- The picture
     chosen = settings.target
     initial = initial_rendering.initial(scene, envmap, settings)
-    asked: tuple[np.ndarray, ...] = ()
+    asked = _asked(chosen, picture, mask)
     if picture is not None:
         painted = painted_image.given(picture, (scene.height, scene.width), initial, mask)
-        source, asked = "painted: given as an array", _given(picture, mask)
+        source = "painted: given as an array"
     elif chosen.kind == "image":
         painted = _painted_files(scene, initial, settings)
-        asked = _bytes_of_files(chosen)
         source = f"painted: {', '.join(chosen.files)}"
     else:
         painted = painted_strokes(scene, initial, chosen.strokes, chosen.display_tonemap)
@@ -208,24 +207,22 @@ def _of_paint(settings, scene, envmap, picture, mask, hidden):
     return Target(picture, weight, None, source, warnings, initial, coverage, asked)
 
 
-def _given(picture, mask):
+def _asked(chosen, picture, mask):
+    """Return what a target was made from: the arrays given, or what the files of a [target] hold."""
+    if picture is None:
+        return tuple(np.fromfile(file, np.uint8) for file in (*chosen.files, *chosen.masks) if file)
     return (picture,) if mask is None else (picture, mask)
-
-
-def _bytes_of_files(chosen):
-    """Return what pictures and masks of a [target] hold, each a file."""
-    return tuple(np.fromfile(file, np.uint8) for file in (*chosen.files, *chosen.masks) if file)
 
 
 def _of_rendering(settings, scene, envmap, picture, mask, how=""):
     """Take a picture of the scene under other light; ``how``: why it is taken for one."""
     # ---- The picture
     chosen, shape = settings.target, (scene.height, scene.width)
+    asked = _asked(chosen, picture, mask)
     if picture is not None:
         everywhere = np.ones(shape) if mask is None else mask
         image = painted_image.given(picture, shape, np.zeros((*shape, 3)), everywhere)
         source = "a picture of the scene, given as an array"
-        asked = _given(picture, mask)
     else:
         unnamed = {"tonemap": "srgb"}
         by_view = _files_by_view(scene, chosen)
@@ -236,7 +233,6 @@ def _of_rendering(settings, scene, envmap, picture, mask, how=""):
 
         image = _of_views(scene, np.zeros((*shape, 3), np.float32), by_view, of_view)
         source = f"a picture of the scene: {', '.join(chosen.files)}"
-        asked = _bytes_of_files(chosen)
 
     # ---- Pixels that count, and its noise
     if not ((image.coverage[..., 0] > 0) & ~image.excluded).any():
@@ -247,8 +243,8 @@ def _of_rendering(settings, scene, envmap, picture, mask, how=""):
     initial, spp, _ = with_noise(settings, scene, envmap)
     spp = rendered_anew.samples(picture, noise, initial, spp, scene.rows)
     source += f"{how}, as noisy as {spp} samples a pixel"
-    target = Target(picture, weight, None, source, tuple(image.warnings), asked=asked, noise=noise, spp=spp)
-    return replace(target, clipped=image.clipped)
+    made = Target(picture, weight, None, source, image.warnings, asked=asked, noise=noise, spp=spp)
+    return replace(made, clipped=image.clipped)
 
 
 def _of_photo(settings, scene, envmap, picture, mask):
@@ -270,7 +266,7 @@ def _of_photo(settings, scene, envmap, picture, mask):
     known = [None if value == "auto" else value for value in (chosen.exposure, chosen.white_balance)]
     photo = replace(photo, curves=curves, stops=known[0], kelvin=known[1])
     photo = photo.under(curves[0], initial, photo.counts)
-    asked = _bytes_of_files(chosen)
+    asked = _asked(chosen, None, None)
     placed = f", {photo.placed.summary}" if photo.placed.summary else ""
     source = f"a photograph of the scene: {file}{placed}"
     counts = None if (photo.counts == 1).all() else photo.counts

@@ -21,9 +21,7 @@ from envedit.targets.pixel_weights import first_hold, hidden_pixels, pixel_weigh
 from envedit.targets.target import Target, with_noise
 
 PIXELS = 128 * 128
-"""Pixels that an edit is solved on with "auto": of pictures of 256x256 pixels, three edits on two scenes, it
-then takes a quarter to two fifths of the time, with the rendering 0.1 to 1.1 dB better and the map 0.8 to
-3.3 dB (``experiments/solver``)."""
+"""Pixels that an edit is solved on with "auto" (``docs/decisions/defaults.md``)."""
 MUCH = 1.8
 """How many times as many pixels a picture must have to be worked on at a smaller size."""
 

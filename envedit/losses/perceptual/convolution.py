@@ -3,12 +3,9 @@
 Activations are flat arrays, channels together: a pixel a row of (H * W, C), as Dr.Jit multiplies tall
 matrices fastest (``docs/decisions/network_layout.md``). A convolution gathers the patches under its kernel
 into a matrix (pixels, taps * channels) and multiplies by the weights; its reverse multiplies by the weights
-again and lets every input pixel gather what the windows over it hold. So nothing is added with atomics, NaN
-is not lost, and the same run gives the same bits. Large images go through in bands of rows, so that the
-matrix of patches stays below :data:`MOST_PATCHES`.
-
-Kernels take sizes as data: one kernel serves all layers and all image sizes. Divisions by sizes, which
-processors do slowly, are products with their inverses in double precision (:class:`Divisor`).
+again and lets every input pixel gather what the windows over it hold. So nothing is added with atomics, and
+the same run gives the same bits. Large images go through in bands of rows, so that the matrix of patches
+stays below :data:`MOST_PATCHES`. Kernels take sizes as data: one serves all layers and all image sizes.
 
 A layer has ``forward(x) -> output``, and those of VGG16 with Hanning pooling, DISTS's network, also
 ``backward(x, output, gradient) -> gradient of x``: all flat arrays without derivatives attached.

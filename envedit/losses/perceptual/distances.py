@@ -1,14 +1,9 @@
 """Perceptual measures on feature stacks, natively in Dr.Jit: DISTS, with its gradient, and LPIPS v0.1.
 
-Both compare display images ``(H, W, 3)``, nominally in [0, 1]; values beyond are taken as they
-are. Identical images give exactly 0, and NaN gives NaN. Both are evaluated as sums of squared differences,
-so that near images keep their digits; sums over pixels run in double precision. DISTS is one node of the AD
-graph, whose gradient is computed by hand together with its value.
-
-A step of DISTS, forward and back, makes 20 GFLOP of matrix products at 256 x 64 pixels, growing with their
-number, and takes about 1.2 times as long as these; it holds some 140 MB beside the weights.
-
-Weights are not part of the package: see `Backbone.load`, `DISTS_SOURCE` and `LPIPS_SOURCE`.
+Both compare display images ``(H, W, 3)``, nominally in [0, 1]; values beyond are taken as they are. Both are
+sums of squared differences, in double precision: identical images give exactly 0, near ones keep their
+digits, and NaN gives NaN. A step of DISTS, forward and back, makes 20 GFLOP of matrix products at 256 x 64
+pixels and holds some 140 MB beside the weights, which are not part of the package (`Backbone.load`).
 """
 
 from __future__ import annotations

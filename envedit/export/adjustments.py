@@ -21,10 +21,9 @@ WIDEST = 60.0
 """Largest radius in degrees over which a light is spread to keep to a bound."""
 SPREAD_TEXELS = 24
 """Texels in the radius of a disc that a light is spread over, at most: of a finer map it is spread on a
-coarser grid and interpolated. Derived: a disc's linear interpolation then errs by 1 / (4 24^2), 0.04 %."""
+coarser grid and interpolated, with an error of 1 / (4 24^2), 0.04 %."""
 SEARCH_WIDTH = 1024
-"""Most columns of the copy on which the radius that keeps to a bound is searched. Derived from time: on 8192
-columns a spread takes seconds and a search ten of them."""
+"""Most columns of the copy on which the radius that keeps to a bound is searched: ten spreads."""
 GROWTH = 1.05
 """Factor on that radius while the map at its own resolution is still above the bound."""
 _NOTHING = 1e-9  # share of a peak that is rounding of a transform

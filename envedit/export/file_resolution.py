@@ -65,10 +65,9 @@ def carried(
 ) -> tuple[inputs.InputMap, np.ndarray]:
     """Carry an edit to the map as its file has it.
 
-    ``settings`` have the lights that were placed by hand, and the regions; ``input_map`` is the map at
-    working size, ``own`` as the file has it, and ``initial`` (h, w, 3) the working map that was edited.
-    Returns the map with its lights placed and its regions changed, and its edit (H, W, 3), radiance before
-    adjustments.
+    ``input_map`` is the map at working size, ``own`` as the file has it, and ``initial`` (h, w, 3) the
+    working map that was edited. Returns the map with its lights placed and its regions changed, as
+    ``settings`` have them, and its edit (H, W, 3), radiance before adjustments.
     """
     if input_map.placed is not None:  # lights that stand in regions that are kept are locked
         kept = map_regions.kept(settings.regions, *input_map.placed.envmap.shape[:2])

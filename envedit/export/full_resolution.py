@@ -38,18 +38,8 @@ def carry(
 
     Layers are evaluated at the source's resolution (``docs/method.md``): its own texels without the cores of
     the lights, times gain and glow; the cores, of the source's own texels, where the lights have gone. A
-    core's border falls off over one working texel, so that no outline of its region is seen; it keeps its
-    flux.
-
-    Of any other representation only what it did to the working map is known: per channel, with W_0 and W the
-    working maps, the source S becomes
-
-    * S W / W_0 where the radiance of a texel and its neighbours at least halves and at most doubles,
-    * S + (W - W_0) where one at least quadruples: a new light,
-    * W where one falls to a quarter: the source's detail is of a light that is gone, and would be its ghost,
-
-    and a mixture between. The ratio is interpolated; the others are linear within each working texel, with
-    its value as their mean. Then the ratio is corrected until the means agree, at last texel by texel.
+    core's border falls off over one working texel and keeps its flux. Of any other representation only what
+    it did to the working map is known (:mod:`.ratio_transfer`).
 
     ``representation`` and ``params`` are of the working map's active rows, ``rows_working``, as edited.
     ``original_working`` and ``edited_working`` (h, w, 3) are the working map before and after; the first is
@@ -58,12 +48,7 @@ def carry(
     Layers know which keep their gain (:meth:`.layers.Layers.keeping`): a light may move across those.
 
     Returns (H, W, 3) float32. Texels of inactive rows, of working texels that are not free, and wherever the
-    edit is the factor 1 have the bits of ``source``. For other representations than layers so has every
-    source texel that overlaps an unchanged working texel, and the mean of every changed one
-    (:func:`.latlong.resize` of the result) differs from ``edited_working`` by at most 1 % of the brightest of
-    it and its neighbours, if the source is at least four times as wide; one that touches an unchanged texel
-    cannot be darkened where a source texel lies in both. A source that is not larger than the working map
-    takes the edited map's values, resized, where it was changed.
+    edit is the factor 1 have the bits of ``source``.
     """
     # ---- The edit, as layers or as a ratio of the working maps
     width = np.shape(edited_working)[1]

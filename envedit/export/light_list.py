@@ -173,8 +173,8 @@ def matched(
     """Find which light of a map has become which light of the edited map.
 
     Of all ways to pair them, the one with the least sum of angle + abs(ln(flux ratio)) (radians; fluxes are
-    means over channels), where a light of ``before`` that is left without another costs :data:`FARTHEST`. Not
-    of squares, so that few lights have changed much rather than many a little. Angles are to where
+    means over channels), where a light of ``before`` that is left without another costs :data:`FARTHEST`.
+    Angles are to where
     ``rotation`` (3, 3), of the whole map between them, brings a light; of one that is known to have gone from
     there, ``moves`` has both directions and the factor of its flux (:meth:`.Layers.light_moves`).
 

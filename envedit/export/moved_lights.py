@@ -20,8 +20,6 @@ from envedit.export.texel_maps import Band, Places
 from envedit.representations.layers import lights
 from envedit.representations.layers.layers import Layers
 
-POINTS_AT_ONCE = 1 << 20
-"""Texels of a light that are moved at a time."""
 NARROWEST = 0.6
 """Least radius of an added light in texels: one that is narrower would vanish between them."""
 REACH = 6.0
@@ -30,15 +28,13 @@ REACH = 6.0
 
 @dataclass(frozen=True)
 class _Points:
-    """Points of one light, placed; ``omega`` is the solid angle of each."""
+    """The points of a light, placed; ``omega`` is the solid angle of each, ``rows`` are those they reach."""
 
-    light: int
     places: tuple[mi.Float, mi.Float, mi.Float]
     flux: mi.Color3f
     omega: mi.Color3f
     half_row: float
-    first: int
-    last: int
+    rows: tuple[int, int]
 
 
 class MovedLights:
@@ -53,7 +49,7 @@ class MovedLights:
     ):
         self.layers, (self.height, self.width) = layers, shape
         self.turn, self.flux, self.size = turn, flux, size
-        self.points: list[_Points] = []
+        self.points: dict[int, _Points] = {}
         self.lobes: list[tuple[mi.Vector3f, float, mi.Color3f]] = []
         self._level: dict[int, np.ndarray] = {}
 
@@ -64,21 +60,17 @@ class MovedLights:
 
         ``share`` (n,) in [0, 1] falls off at the border of the core, which keeps its flux.
         """
-        omega = latlong.lookup_solid_angles(self.height, self.width)
-        flux = np.float64(radiance) * omega[row][:, None]
+        # ---- Flux and solid angle of each point
+        omega = latlong.lookup_solid_angles(self.height, self.width)[row]
+        flux = np.float64(radiance) * omega[:, None]
         soft = flux * share[:, None]
         kept = soft.sum(axis=0)
         flux = soft * np.divide(flux.sum(axis=0), kept, out=np.ones(3), where=kept > 0)
-        for k in range(0, len(row), POINTS_AT_ONCE):
-            part = slice(k, k + POINTS_AT_ONCE)
-            self._place(light, row[part], column[part], flux[part], omega[row[part]])
-
-    def _place(self, light, row, column, flux, omega):
         if len(row) == 1:  # a single one would be a scalar, and another kernel
             row, column, flux, omega = (np.repeat(v, 2, axis=0) for v in (row, column, flux / 2, omega / 2))
+
+        # ---- Where they go
         factor = float(lights.size_factor(self.size[light, 0]))
-        half_row = max(1.0, factor)
-        flux = flux * lights.flux_factor(self.flux[light])
         point = vectors(mi.Vector3f, lights.points(row, column, self.height, self.width))
         size = dr.opaque(mi.Float, factor)
         centre = vectors(mi.Vector3f, self.layers.lights.centres[light])
@@ -86,11 +78,15 @@ class MovedLights:
         sine = flat(mi.Float, np.sin(np.pi * row / (self.height - 1)).astype(np.float32)) * size
         places = lights.placed(point, centre, turn, size, sine, (self.height, self.width))
         dr.eval(places)
+        half_row = max(1.0, factor)
         reach = places[0].numpy()
-        first, last = int(np.floor(reach.min() - half_row)), int(np.ceil(reach.max() + half_row))
-        omega = mi.Color3f(flat(mi.Float, (omega * factor**2).astype(np.float32)))
-        flux = vectors(mi.Color3f, flux)
-        self.points.append(_Points(int(light), places, flux, omega, half_row, first, last))
+        self.points[light] = _Points(
+            places,
+            vectors(mi.Color3f, flux * lights.flux_factor(self.flux[light])),
+            mi.Color3f(flat(mi.Float, (omega * factor**2).astype(np.float32))),
+            half_row,
+            (int(np.floor(reach.min() - half_row)), int(np.ceil(reach.max() + half_row))),
+        )
 
     def place_lobe(self, light: int) -> None:
         """Place a light that was added: radiance that falls off as a Gaussian of the angle."""
@@ -119,11 +115,10 @@ class MovedLights:
 
     def level(self, grid: Places) -> None:
         """Find what makes up for the flux that dividing by the density takes or gives."""
-        flux = {p.light: np.zeros((2, 3)) for p in self.points}
+        flux = {light: np.zeros((2, 3)) for light in self.points}
         omega = latlong.lookup_solid_angles(self.height, self.width)
         for band in grid.bands():
-            for light in self._reaching(band):
-                total, density = self._shared_out(light, band)
+            for light, total, density in self._shared_out(band):
                 for k, image in enumerate((total, total / density)):
                     rows = image.numpy()[band.fresh - band.start :].sum(axis=1, dtype=np.float64)
                     flux[light][k] += omega[band.fresh : band.stop] @ rows
@@ -132,24 +127,20 @@ class MovedLights:
 
     def radiance(self, band: Band) -> Iterator[mi.TensorXf]:
         """Yield the radiance (size, W, 3) of each light that reaches a band."""
-        for light in self._reaching(band):
+        for light, total, density in self._shared_out(band):
             # Points on a turned grid lie closer here and farther there: a pattern of fine stripes, otherwise.
-            total, density = self._shared_out(light, band)
             level = flat(mi.Float, self._level[light])
             yield total / density * dr.reshape(mi.TensorXf(level), (1, 1, 3))
 
-    def _reaching(self, band):
-        return sorted({p.light for p in self.points if p.first < band.stop and p.last >= band.start})
-
-    def _shared_out(self, light, band):
-        """Share out the points of a light in a band: radiance, and its density, which should be 1."""
-        total, density = 0, 0
+    def _shared_out(self, band):
+        """Yield of each light that reaches a band its radiance there, and its density, which should be 1."""
         rows = band.start, self.height
-        for p in self.points:
-            if p.light == light and p.first < band.stop and p.last >= band.start:
-                total += lights.shared_out(*p.places, p.flux, p.half_row, band.shape, rows)
-                density += lights.shared_out(*p.places, p.omega, p.half_row, band.shape, rows)
-        return total, dr.clip(density, 0.5, 2)
+        for light, p in sorted(self.points.items()):
+            if p.rows[0] < band.stop and p.rows[1] >= band.start:
+                total, density = (
+                    lights.shared_out(*p.places, v, p.half_row, band.shape, rows) for v in (p.flux, p.omega)
+                )
+                yield light, total, dr.clip(density, 0.5, 2)
 
 
 def _lobe(angle, library):

@@ -1,6 +1,18 @@
 """What was done to a working map, done to its source: for edits of which nothing else is known.
 
-See :func:`.full_resolution.carry` for what is kept and how closely.
+Per channel, with W_0 and W the working map before and after, the source S becomes
+
+* S W / W_0 where the radiance of a texel and its neighbours at least halves and at most doubles,
+* S + (W - W_0) where one at least quadruples: a new light,
+* W where one falls to a quarter: the source's detail is of a light that is gone, and would be its ghost,
+
+and a mixture between. The ratio is interpolated; the others are linear within each working texel, with its
+value as their mean. Then the ratio is corrected until the means agree, at last texel by texel.
+
+Every source texel that overlaps an unchanged working texel has the bits of the source. The mean of every
+changed one (:func:`.latlong.resize` of the result) differs from W by at most 1 % of the brightest of it and
+its neighbours, if the source is at least four times as wide; one that touches an unchanged texel cannot be
+darkened where a source texel lies in both. A source that is not larger takes W, resized, where it changed.
 """
 
 from __future__ import annotations
@@ -17,7 +29,7 @@ from envedit.export.texel_maps import Band, Places
 MODERATE = 4.0
 """Largest ratio by which a texel of the source is scaled."""
 TOLERANCE = 0.005
-"""Of the means of working texels, relative to their radiance; see :func:`.full_resolution.carry`."""
+"""Of the means of working texels, relative to their radiance."""
 LEAST = 1e-3
 """Radiance, relative to the mean of the edited map, that the tolerance is relative to at least."""
 ROUNDS = 3, 3
@@ -25,7 +37,7 @@ ROUNDS = 3, 3
 
 
 class Ratio:
-    """What was done to a working map, applied to its source; see :func:`.full_resolution.carry`."""
+    """What was done to a working map, applied to its source."""
 
     def __init__(self, original: np.ndarray, edited: np.ndarray, free: np.ndarray | None, grid: Places):
         self.grid = grid

@@ -1,9 +1,8 @@
 """Where the texels of a large map lie among those of a coarser one, and the bands in which it is worked on.
 
 A band is some rows of the large map. What is known at the coarser map's texels is interpolated along the rows
-on the host, where it is small, and across the columns on the device. What is smooth is interpolated by cubic
-convolution (Keys 1981, a = -1/2): linearly, the log factor of a reflection that is taken away, 25 at its
-centre and five texels wide, errs by 5 %, and texels of the coarser map show as bars.
+on the host, where it is small, and across the columns on the device; what is smooth by cubic convolution
+(Keys 1981, a = -1/2), as texels of the coarser map would show as bars with linear interpolation.
 """
 
 from __future__ import annotations

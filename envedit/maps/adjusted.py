@@ -18,7 +18,7 @@ from envedit.representations.layers.oriented import oriented
 
 BLUR_TEXELS = 3.0
 """Standard deviation of a blur in texels of the grid that it is computed on: finer maps are reduced and
-interpolated. Derived: the box and the tent of that add 1/12 and 1/6 to a variance of 9: 1.4 % wider."""
+interpolated, by which it is 1.4 % wider."""
 BLUR_REACH = 4.0
 """Standard deviations at which the kernel of a blur ends, at 3e-4 of its peak."""
 
@@ -83,9 +83,8 @@ def saturated(radiance: np.ndarray, factor: float) -> np.ndarray:
 def blur(radiance: np.ndarray, degrees: float) -> np.ndarray:
     """Blur a map (H, W, 3) on the sphere by exp((cos g - 1) / s^2) of the angle g.
 
-    That is a Gaussian where s, the standard deviation in ``degrees``, is small. With less than a fifth of a
-    texel the map is returned as it is.
-    Flux, radiance times :func:`.latlong.lookup_solid_angles`, is kept.
+    That is a Gaussian where s, the standard deviation in ``degrees``, is small. Flux, radiance times
+    :func:`.latlong.lookup_solid_angles`, is kept; below a fifth of a texel the map itself is returned.
     """
     height, width = radiance.shape[:2]
     if degrees < 0.2 * 360 / width:

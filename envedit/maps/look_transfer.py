@@ -1,8 +1,7 @@
 """Looks of edits, and looks applied to maps: lights placed, the sky graded, at the resolution of the file.
 
 A map's own lights move and change as an edit moves them, with their glow; one that the map does not have is
-added, round and with a soft glow. What is found on a small working map is carried to the file by
-:func:`.full_resolution.carry`.
+added, round and with a soft glow.
 """
 
 from __future__ import annotations
@@ -36,11 +35,9 @@ as a light with a soft glow. Not measured: in proportion, the glow of a hazy sun
 AUREOLE = 4.0
 AUREOLE_DEGREES = 12.0
 """Glow of an added key light: AUREOLE exp(-angle / AUREOLE_DEGREES) of the sky's radiance. The slope is that
-of clear suns of the PureSky maps, whose glows fall from 12 to 42 within 5 degrees to 3 to 8 at 20; the height
-is less, for skies with clouds. Not measured beside others."""
+of clear suns; the height is less, for skies with clouds. Not measured beside others."""
 ADDED_DEGREES = 0.1
-"""Standard deviation of an added light that may be a sun. Derived: 97 % of its flux are within 0.27 degrees,
-the sun's radius."""
+"""Standard deviation of an added light that may be a sun: 97 % of its flux are within the sun's radius."""
 _GAUSSIAN_97 = math.sqrt(-2 * math.log(0.03))  # radius within which 97 % of a Gaussian's flux lie
 _ROUNDS = 16  # of fitting fluxes to the sky that they light
 _ENOUGH = 1e-3  # relative change of that sky at which it ends

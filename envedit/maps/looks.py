@@ -36,7 +36,7 @@ LEAST_SHARE = 1 / 8
 """Least flux of fill and rim over the key's: edges of clouds are below it. Not measured."""
 RIDGE = 1e-3
 """Weight of the squared coefficients beside the mean squared misfit: keeps a gain that the sky does not
-determine at 0. Derived: it takes less than 1 % from a coefficient of an even gain."""
+determine at 0, and takes less than 1 % from a coefficient of an even one."""
 FAINTEST = 1e-3
 """Radiance over the sky's mean that is added before logarithms: black ground has no gain. Not measured."""
 MOST_STOPS = 16.0
@@ -86,10 +86,8 @@ class Look:
 def harmonics(d: np.ndarray) -> np.ndarray:
     """Evaluate the real spherical harmonics up to order 2 at directions.
 
-    Y_0, then y, z, x, then xz, xy, yz, 3 y^2 - 1 and x^2 - z^2, orthonormal on the sphere. Below the horizon
-    they have their value at the mirrored direction: ground goes with the sky above it.
-
-    ``d`` (..., 3) are unit vectors, +y up; returns (..., 9).
+    Y_0, then y, z, x, then xz, xy, yz, 3 y^2 - 1 and x^2 - z^2, orthonormal on the sphere, with the values of
+    the mirrored direction below the horizon. ``d`` (..., 3) are unit vectors, +y up; returns (..., 9).
     """
     x, y, z = d[..., 0], np.abs(d[..., 1]), d[..., 2]
     first = 0.5 * math.sqrt(3 / math.pi)

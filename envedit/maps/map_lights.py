@@ -12,8 +12,7 @@ from envedit.export import light_list
 from envedit.representations.layers.separation import Light
 
 IRRADIANCE_WIDTH = 512
-"""Most columns of the copy that irradiance is integrated over. Within a texel of it, 0.7 degrees, the cosine
-changes by less than 1.3 %, and the mean over the texel by 1e-5. Derived."""
+"""Most columns of the copy that irradiance is integrated over: a texel's mean cosine then errs by 1e-5."""
 AXES = {
     "+x": (1, 0, 0), "-x": (-1, 0, 0), "+y": (0, 1, 0), "-y": (0, -1, 0), "+z": (0, 0, 1), "-z": (0, 0, -1),
 }  # fmt: skip

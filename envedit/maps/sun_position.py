@@ -13,7 +13,7 @@ from envedit.core.errors import ConfigError
 
 YEARS = 1800, 2200
 """Years in which time on clocks is taken for the uniform time of the formulas: the difference is below 7
-minutes, in which the sun moves by 0.005 degrees along the ecliptic. Derived."""
+minutes, 0.005 degrees along the ecliptic."""
 PARALLAX_DEGREES = 8.794 / 3600
 """The sun's horizontal parallax."""
 

@@ -28,8 +28,8 @@ sphere alone does not show how it is turned."""
 LEAST_GAIN = 1.02
 """Correlation over that of the picture as it lies, from which on it is resampled."""
 CLEAR_PEAK = 5.0
-"""Correlation of the best shift, in standard deviations of all shifts, from which on outlines agree. Of four
-shipped scenes under four skies at 64 and 128 pixels, the shift was right from 5.4 on and wrong up to 4.7."""
+"""Correlation of the best shift, in standard deviations of all shifts, from which on outlines agree: it was
+right from 5.4 on and wrong up to 4.7 (``docs/decisions/defaults.md``)."""
 FINEST = 1 / 32
 """Last step of the refinement, pixels at the border of the film."""
 

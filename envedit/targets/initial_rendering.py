@@ -133,11 +133,8 @@ def stated_origin(file: FilePath, info: Info, expected: Mapping[str, object]) ->
 
     The file beside it is the one with its name, where it was saved over the export; otherwise, of those in
     its folder that are of the same scene, the one that differs from this run in the fewest values. ``info``
-    is of :func:`envedit.images.images.read_stored`, ``expected`` what an export of this run says. What is
-    returned is as :func:`origin`, values as text; empty where nothing is said.
-
-    InputError if a value of :data:`KEYS` is not that of this run: the rendering is not the one that was
-    painted on.
+    is of :func:`envedit.images.images.read_stored`, ``expected`` what an export of this run says. Returns
+    values as of :func:`origin`, as text. InputError if one of :data:`KEYS` is not that of this run.
     """
     file = Path(os.fsdecode(file))
     facts = {k[len(_PREFIX) :]: str(v) for k, v in info["metadata"].items() if k.startswith(_PREFIX)}

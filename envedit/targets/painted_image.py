@@ -46,10 +46,8 @@ def read(
       names, or that of the export, unless the unpainted pixels are those of the rendering under another.
     - A picture of another size and the rendering's aspect is resampled.
     - Where a PNG or JPEG is white in a channel, the value is a lower bound, ``clipped``: such pixels are
-      excluded, but for those that were neither painted nor clipped before. Black is no such limit: there is
-      nothing below it.
-    - With alpha, colour counts as laid over the initial rendering; without that the colour is taken as it is,
-      and coverage is alpha.
+      excluded, but for those that were neither painted nor clipped before.
+    - With alpha, colour counts as laid over the initial rendering, or is taken as it is without one.
 
     ``initial`` (h, w, 3), linear radiance, is what was painted on; without it every pixel counts as painted.
     A ``mask`` (:func:`read_mask`), white where it was painted, takes the place of comparing. ``exported`` is

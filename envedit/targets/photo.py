@@ -31,8 +31,8 @@ LEAST_TELLING = 0.02
 EXPOSURE_DEVIATION = 3.0
 """Standard deviation of the exposure, in stops: cameras make a picture of any light."""
 BALANCE_DEVIATION, TINT_DEVIATION = 0.59, 0.1
-"""Standard deviations of a white balance along the second and third of :data:`.AXES`: the root mean square of
-temperatures from 3200 to 9000 K, evenly in mired, about 6500 K; and that of a sky's tint."""
+"""Standard deviations of a white balance along the second and third of :data:`.AXES`: of temperatures from
+3200 to 9000 K, evenly in mired, about 6500 K; and of a sky's tint."""
 HELD_DEVIATION = 1e-3
 """Standard deviation of what the configuration gives."""
 MOST_ASPECT = 1.03

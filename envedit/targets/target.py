@@ -1,11 +1,8 @@
 """What the rendering should look like: under another light, as a painted picture, or under strokes.
 
-A picture that was painted asks two things: that the pixels under the paint become as painted, and that all
-others stay as they are. Each of the two has a weight of its own, shared among its pixels, so that a small
-stroke is not outvoted by the many pixels around it.
-
-Where the scene has several views, what is painted belongs to one of them, and views on which nothing was
-painted stay as they are: their target is their initial rendering.
+Pixels under paint should become as painted, and all others stay as they are. Each of the two has a weight of
+its own, shared among its pixels, so that a small stroke is not outvoted by the many pixels around it. Views
+of a scene on which nothing was painted stay as they are: their target is their initial rendering.
 """
 
 from __future__ import annotations
@@ -117,13 +114,12 @@ def make(
     mask: np.ndarray | None = None,
     other: np.ndarray | None = None,
 ) -> Target:
-    """Make the target of a configuration: of its target, and of seed and repair of the input.
+    """Make the target of a configuration.
 
     ``envmap`` (H, W, 3) is the map that will be edited; turned by ``rotate_degrees`` where the target names
     no file. In place of what the configuration names may be given: a painted ``picture`` (h, w, 3), linear
-    radiance, and how much each pixel of it was painted, ``mask`` (h, w), in [0, 1], by default seen by
-    comparing with the initial rendering; or the ``other`` map (H, 2 H, 3) to render under, in the units of a
-    file.
+    radiance, and how much each pixel of it was painted, ``mask`` (h, w), in [0, 1], by default found by
+    comparison; or the ``other`` map (H, 2 H, 3) to render under, in the units of a file.
 
     InputError if a file cannot be read, a picture does not fit the film, or the other map is brighter than
     :data:`.radiance.BRIGHTEST`; a picture that is so bright is cut there, with a warning. ConfigError if a

@@ -6,13 +6,9 @@ sine layers, a linear layer and a sigmoid::
     h_0 = sin(omega (W_0 x + b_0)),   h_i = sin(omega (W_i h_{i-1} + b_i)),   y = sigmoid(W h_depth + b)
 
 Parameters are a flat dict of tensors, ``"0.weight"`` (out, in) and ``"0.bias"`` (out,) upwards. Activations
-are (N, width), a point a row: Dr.Jit multiplies a tall matrix by a small one faster than a small one by a
-wide one, whose rows lie far apart in memory (``docs/decisions/network_layout.md``).
-
-The reverse pass is written by hand. It keeps sine and cosine of each layer (``dr.sincos`` gives both for the
-price of one), and needs two matrix products a layer beside the forward one: that is the least possible. A
-bias gradient is a sum over points, of which every lane takes a stretch; a product with ones takes longer
-(``docs/decisions/network_layout.md``).
+are (N, width), a point a row. The reverse pass is written by hand: it keeps sine and cosine of each layer,
+and needs two matrix products a layer beside the forward one. A bias gradient is a sum over points, of which
+every lane takes a stretch (``docs/decisions/network_layout.md``).
 """
 
 from __future__ import annotations
@@ -52,11 +48,7 @@ def init(seed: int, hidden: int = 256, depth: int = 6, omega: float = 30.0, inpu
 
 
 def coordinates(height: int, width: int) -> mi.TensorXf:
-    """Texel centres as network coordinates (H * W, 2), columns (y, x) in (-1, 1), row-major over texels.
-
-    Centres, not corners: the same picture area is covered at every resolution, so that a network fitted at
-    one can be evaluated at another without a shift.
-    """
+    """Return texel centres as network coordinates (H * W, 2): (y, x) in (-1, 1), row after row."""
     y = (2 * np.arange(height) + 1) / height - 1
     x = (2 * np.arange(width) + 1) / width - 1
     grid = np.stack(np.meshgrid(y, x, indexing="ij"), axis=-1).reshape(-1, 2)

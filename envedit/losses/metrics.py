@@ -108,7 +108,7 @@ def compare(
     parts = [(len(a[rows]) / len(a), a[rows], b[rows]) for rows in views or (slice(None),)]
     alike = sum(share * ssim(x, y) for share, x, y in parts)
     apart = None
-    if lpips is not None and min(min(x.shape[:2]) for _, x, _ in parts) >= lpips.backbone.least_size("max"):
+    if lpips is not None and min(min(x.shape[:2]) for _, x, _ in parts) >= lpips.backbone.least_size:
         apart = sum(share * lpips(x, y) for share, x, y in parts)
     here = np.ones(a.shape[:2], bool) if seen is None or not np.any(seen) else seen
     a, b, radiance_a, radiance_b = (image[here][None] for image in (a, b, *radiance))

@@ -50,9 +50,9 @@ def differs(values: np.ndarray, before: np.ndarray, info: Info, top: int, spread
 def _painted_jpeg(codes, before, quality):
     """Return where (h, w) a JPEG was painted.
 
-    Where there is no paint, the file shows the rendering that was painted on, compressed as the file is. Paint
-    adds edges, so the rendering with the paint found is compressed as well, and what its noise explains is
-    not paint.
+    Where there is no paint, the file shows the rendering that was painted on, compressed as the file is.
+    Paint adds edges, so the rendering with the paint found is compressed as well, and what its noise explains
+    is not paint.
     """
     off = np.abs(codes - before).max(axis=2)
     bled = JPEG_SHARE * _largest(off)

@@ -45,18 +45,20 @@ class Painted:
     # (h, w, 1) float32, in [0, 1], how much of a pixel was painted: under strokes, whatever their opacity
     # (but not if that is 0), 1 - prod(1 - c)
     coverage: np.ndarray
-    # bool (h, w), pixels of a file without information: clipped, or transparent over nothing; None: none
-    excluded: Any = None
-    clipped: Any = None  # bool (h, w, 3), values of a file that say "at least so bright"; None: none
+    excluded: Any = None  # bool (h, w), pixels without information: clipped, or transparent over nothing
+    clipped: np.ndarray | None = None  # bool (h, w, 3), values that say "at least so bright"; None: none
     warnings: tuple[str, ...] = ()  # what the user should know
 
 
-def paint(picture: np.ndarray, strokes: Sequence[dict], tonemap: str = "gamma") -> Painted:
+def paint(
+    picture: np.ndarray, strokes: Sequence[dict], tonemap: str = "gamma", numbers: Sequence[int] | None = None
+) -> Painted:
     """Paint strokes on a picture (h, w, 3), finite linear radiance, each on the result of those before it.
 
     Negative values are taken as black where a stroke works on display values. ``strokes`` are as in a
     configuration's ``target.strokes``; erase-shadow, contrast and blur work on a display of this ``tonemap``,
-    one of :data:`envedit.core.color.TONEMAPS`. ConfigError if a stroke or the tonemap cannot be understood.
+    one of :data:`envedit.core.color.TONEMAPS`. Warnings name strokes by their ``numbers``, by default their
+    places in the list. ConfigError if a stroke or the tonemap cannot be understood.
     """
     image = np.asarray(picture, np.float32)
     display = Display(tonemap)
@@ -64,7 +66,7 @@ def paint(picture: np.ndarray, strokes: Sequence[dict], tonemap: str = "gamma") 
     result = image.astype(np.float64)
     bare = np.ones((height, width, 1))
     warnings = []
-    for i, stroke in enumerate(StrokeList()(strokes)):
+    for i, stroke in zip(numbers or range(len(strokes)), StrokeList()(strokes), strict=True):
         name = f"target.strokes[{i}] ({stroke['type']})"
         if not stroke["opacity"]:
             warnings.append(f"{name}: opacity 0, nothing was painted")
@@ -87,7 +89,8 @@ def paint(picture: np.ndarray, strokes: Sequence[dict], tonemap: str = "gamma") 
         bare *= 1 - covered
     total = (1 - bare).astype(np.float32)
     picture = np.where(total > 0, result.astype(np.float32), image)
-    return Painted(picture, total, warnings=tuple(warnings))
+    nothing = np.zeros(picture.shape, bool)
+    return Painted(picture, total, nothing[..., 0], nothing, tuple(warnings))
 
 
 # ---- Display values ----------------------------------------------------------------------------------------

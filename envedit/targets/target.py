@@ -7,7 +7,6 @@ of a scene on which nothing was painted stay as they are: their target is their 
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -310,21 +309,12 @@ def painted_strokes(
     ConfigError if a stroke is of a view that the scene has not.
     """
     numbers = [scene.view(s.get("view", 0), f"target.strokes[{i}].view") for i, s in enumerate(painted)]
-    warnings: list[str] = []
 
     def of_view(k, before):
         own = [i for i, number in enumerate(numbers) if number == k]
-        made = strokes.paint(before, [painted[i] for i in own], tonemap)
-        warnings.extend(_renumbered(line, own) for line in made.warnings)
-        nothing = np.zeros(before.shape, bool)
-        return replace(made, excluded=nothing[..., 0], clipped=nothing, warnings=())
+        return strokes.paint(before, [painted[i] for i in own], tonemap, own)
 
-    return replace(_of_views(scene, picture, numbers, of_view), warnings=tuple(warnings))
-
-
-def _renumbered(line, own):
-    """Give a stroke that a warning begins with its place in the configuration's list."""
-    return re.sub(r"^target\.strokes\[(\d+)\]", lambda m: f"target.strokes[{own[int(m[1])]}]", line)
+    return _of_views(scene, picture, numbers, of_view)
 
 
 def _of_views(scene, initial, painted, of_view):

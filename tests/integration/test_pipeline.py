@@ -336,7 +336,7 @@ def test_a_siren_reaches_a_sky_brighter_than_any_texel_of_the_map(tmp_path, rng)
 class Stub:
     """A measure that is the mean squared difference of display values."""
 
-    backbone = types.SimpleNamespace(least_size=lambda pooling: 5)
+    backbone = types.SimpleNamespace(least_size=5)
 
     def against(self, reference):
         return lambda x: dr.mean(dr.square(x.array - reference.array))

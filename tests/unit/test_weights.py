@@ -238,7 +238,7 @@ def small_network():
 @pytest.fixture
 def distributions(monkeypatch, rng):
     """Put distributions of two small networks in the place of those that pip would fetch."""
-    networks = {kind: (kind, small_network, file, file) for kind, file in (("alex", "a"), ("vgg", "v"))}
+    networks = {kind: (kind, small_network(), 5, kind, kind) for kind in ("alex", "vgg")}
     monkeypatch.setattr(download, "KINDS", networks)
     kernels = [rng.random((3, 3, 3, 4), np.float32), rng.random((1, 1, 4, 5), np.float32)]
     heads = Storage("1", rng.random(4, np.float32))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,7 +11,7 @@ import numpy as np
 
 from envedit.core.arrays import tensor
 from envedit.core.errors import InputError
-from envedit.core.types import DrArray, FilePath
+from envedit.core.types import DrArray, FilePath, Shape
 from envedit.losses.perceptual import convolution, weights
 
 # ---- The stacks, as torchvision has them -------------------------------------------------------------------
@@ -65,10 +64,11 @@ def _alexnet():
 
 
 KINDS = {
-    "vgg": ("VGG16", _vgg16, "vgg16", "vgg16-397923af.pth"),
-    "alex": ("AlexNet", _alexnet, "alexnet", "alexnet-owt-7be5be79.pth"),
+    "vgg": ("VGG16", _vgg16(), 16, "vgg16", "vgg16-397923af.pth"),
+    "alex": ("AlexNet", _alexnet(), 31, "alexnet", "alexnet-owt-7be5be79.pth"),
 }
-"""Name as LPIPS has it -> title, layers, torchvision's name, torchvision's file."""
+"""Name as LPIPS has it -> title, layers, least pixels along each side of an image, which leave one after the
+last layer, torchvision's name, torchvision's file."""
 
 
 class Backbone:
@@ -79,8 +79,7 @@ class Backbone:
     """
 
     def __init__(self, kind: str, tensors: dict[str, np.ndarray]):
-        self.title = KINDS[kind][0]
-        self.layers = KINDS[kind][1]()
+        self.title, self.layers, self.least_size, _, _ = KINDS[kind]
         self.channels = [layer.outputs for layer in self.layers if isinstance(layer, Conv) and layer.tap]
         self.weights: list[Any] = [
             _as_matrix(layer, tensors) if isinstance(layer, Conv) else None for layer in self.layers
@@ -92,45 +91,25 @@ class Backbone:
 
         Further tensors, such as those of the classifier, are ignored; errors as of :func:`.weights.read`.
         """
-        words, layers, model, original = KINDS[kind]
+        words, layers, _, model, original = KINDS[kind]
         shapes: dict[str, tuple[int, ...]] = {}
-        for layer in layers():
+        for layer in layers:
             shapes |= layer.parts() if isinstance(layer, Conv) else {}
         source = f"torchvision.models.{model}, https://download.pytorch.org/models/{original}"
         return cls(kind, weights.read(file, shapes, words, source))
 
-    def least_size(self, pooling: str = "max") -> int:
-        """Return how many pixels an image must have along each side to leave one after the last layer."""
-        return next(n for n in range(1, 256) if self._sizes(n, pooling)[-1] > 0)
-
     def stack(self, height: int, width: int, pooling: str = "max") -> Stack:
         """Lay the network out for images of one size; InputError if nothing would be left of them.
 
-        ``pooling`` is "max", or "hanning" for the L2 pooling of DISTS in place of every max pooling.
+        ``pooling`` is "max", or "hanning" for the L2 pooling of DISTS in place of every max pooling, which
+        takes images of any size.
         """
-        rows, columns = self._sizes(height, pooling), self._sizes(width, pooling)
-        if min(rows[-1], columns[-1]) < 1:
-            least = self.least_size(pooling)
+        if pooling == "max" and min(height, width) < self.least_size:
             raise InputError(
                 f"image of {height} rows and {width} columns: too small for {self.title}; "
-                f"it needs {least} of each."
+                f"it needs {self.least_size} of each."
             )
-        return Stack(self, list(zip(rows, columns, strict=True)), pooling)
-
-    def _sizes(self, n, pooling):
-        """Sizes along one side: of the image, and after every layer; 0 from where nothing is left."""
-        sizes = [n]
-        for layer in self.layers:
-            sizes.append(_size_after(layer, sizes[-1], pooling) if sizes[-1] else 0)
-        return sizes
-
-
-def _size_after(layer, n, pooling):
-    if isinstance(layer, Conv):
-        return max((n + 2 * layer.padding - layer.kernel) // layer.stride + 1, 0)
-    if pooling == "hanning":
-        return (n - 1) // 2 + 1
-    return max((n - layer.kernel) // 2 + 1, 0)
+        return Stack(self, height, width, pooling)
 
 
 def _as_matrix(layer, tensors):
@@ -149,26 +128,23 @@ class Stack:
     Gradients are pulled back through the network of DISTS: VGG16 with "hanning".
     """
 
-    def __init__(self, backbone: Backbone, sizes: Sequence[tuple[int, int]], pooling: str):
+    def __init__(self, backbone: Backbone, height: int, width: int, pooling: str):
         self._steps: list[Any] = []
         self._tapped: list[tuple[int, int, int]] = []
-        channels = 3
+        size: Shape = (height, width, 3)
         step: Any
-        for i, layer in enumerate(backbone.layers):
-            before, after = (*sizes[i], channels), sizes[i + 1]
+        for layer, parameters in zip(backbone.layers, backbone.weights, strict=True):
             if isinstance(layer, Conv):
-                channels = layer.outputs
-                matrix, bias = backbone.weights[i]
-                step = convolution.Convolution(
-                    matrix, bias, before, (*after, channels), layer.kernel, layer.stride, layer.padding
-                )
-                if layer.tap:
-                    self._tapped.append((i + 1, after[0] * after[1], channels))
+                matrix, bias = parameters
+                step = convolution.Convolution(matrix, bias, size, layer.kernel, layer.stride, layer.padding)
             elif pooling == "hanning":
-                step = convolution.HanningPool(before, (*after, channels))
+                step = convolution.HanningPool(size)
             else:
-                step = convolution.MaxPool(layer.kernel, before, (*after, channels))
+                step = convolution.MaxPool(layer.kernel, size)
+            size = step.after
             self._steps.append(step)
+            if isinstance(layer, Conv) and layer.tap:
+                self._tapped.append((len(self._steps), size[0] * size[1], size[2]))
 
     def forward(self, x: DrArray) -> list:
         """Return the image and the output of every layer: what :meth:`taps` and :meth:`backward` need.

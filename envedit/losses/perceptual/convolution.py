@@ -45,14 +45,14 @@ class _Windows:
     Channels are read and written ``together``, by fours where there are fours; such a packet has one index.
     """
 
-    def __init__(self, before, after, kernel, stride, padding):
+    def __init__(self, before, kernel, stride, padding):
         self.before = before
-        self.after = after[:2]
+        self.after = after = tuple((n + 2 * padding - kernel) // stride + 1 for n in before[:2])
         self.kernel = kernel
         self.stride = stride
         self.together = 4 if before[2] % 4 == 0 else 1
         self.packets = before[2] // self.together
-        sizes = *before[:2], *after[:2], stride, padding
+        sizes = *before[:2], *after, stride, padding
         self._h, self._w, self._h_after, self._w_after, self._s, self._p = (
             dr.opaque(mi.Int32, size) for size in sizes
         )
@@ -126,32 +126,22 @@ class _Windows:
 class Convolution:
     """Convolution with zeros around the image, and ReLU."""
 
-    def __init__(
-        self,
-        matrix: Tensor,
-        bias: DrArray,
-        before: Shape,
-        after: Shape,
-        kernel: int,
-        stride: int,
-        padding: int,
-    ):
+    def __init__(self, matrix: Tensor, bias: DrArray, before: Shape, kernel: int, stride: int, padding: int):
         self._matrix = matrix
         self._bias = bias
-        self._before = before
-        self._after = after
-        self._outputs = after[2]
         self._kernel = kernel
         self._padding = padding
         self._columns = kernel * kernel * before[2]
-        self._windows = _Windows(before, after, kernel, stride, padding)
-        self._by_outputs = Divisor(after[2])
-        self._rows = max(MOST_PATCHES // (after[1] * self._columns), 1)
+        self._windows = _Windows(before, kernel, stride, padding)
+        self._outputs = len(bias)
+        self._by_outputs = Divisor(self._outputs)
+        self.after: Shape = (*self._windows.after, self._outputs)
+        self._rows = max(MOST_PATCHES // (self.after[1] * self._columns), 1)
 
     def forward(self, x: DrArray) -> DrArray:
         """Return max(W patches + bias, 0)."""
         windows = self._windows
-        height = self._after[0]
+        height = self.after[0]
         parts = []
         for first in range(0, height, self._rows):
             rows = min(self._rows, height - first)
@@ -170,12 +160,12 @@ class Convolution:
         """Pull a gradient back, of a stride of 1; where the ReLU gave 0, its slope is 0."""
         gradient = dr.select(y <= 0, 0, gradient)
         dr.eval(gradient)
-        height = self._before[0]
+        height = self._windows.before[0]
         parts = []
         for first in range(0, height, self._rows):
             stop = min(first + self._rows, height)
             low = max(first + self._padding - self._kernel + 1, 0)
-            high = min(stop + self._padding, self._after[0])
+            high = min(stop + self._padding, self.after[0])
             parts.append(self._pull(gradient, first, stop, low, high))
             dr.eval(parts[-1])
         return _joined(parts)
@@ -188,8 +178,8 @@ class Convolution:
         F = type(gradient)
         windows = self._windows
         i, row, column, c = windows.inputs(first, stop - first)
-        if (low, high) != (0, self._after[0]):
-            row_length = self._after[1] * self._outputs
+        if (low, high) != (0, self.after[0]):
+            row_length = self.after[1] * self._outputs
             part = dr.arange(mi.UInt32, (high - low) * row_length) + dr.opaque(mi.UInt32, low * row_length)
             gradient = dr.gather(F, gradient, part)
         patches = dr.matmul(_rows_of(gradient, self._outputs), self._weights(F)).array
@@ -203,9 +193,10 @@ class Convolution:
 class MaxPool:
     """Max pooling, every second pixel."""
 
-    def __init__(self, kernel: int, before: Shape, after: Shape):
+    def __init__(self, kernel: int, before: Shape):
         self._kernel = kernel
-        self._windows = _Windows(before, after, kernel, 2, 0)
+        self._windows = _Windows(before, kernel, 2, 0)
+        self.after: Shape = (*self._windows.after, before[2])
 
     def forward(self, x: DrArray) -> DrArray:
         """Return the largest of every window, NaN where it has one."""
@@ -224,8 +215,9 @@ class MaxPool:
 class HanningPool:
     """L2 pooling of DISTS: sqrt(sum of w x^2 + 1e-12), w a 3 x 3 Hanning window, every second pixel."""
 
-    def __init__(self, before: Shape, after: Shape):
-        self._windows = _Windows(before, after, 3, 2, 1)
+    def __init__(self, before: Shape):
+        self._windows = _Windows(before, 3, 2, 1)
+        self.after: Shape = (*self._windows.after, before[2])
 
     def forward(self, x: DrArray) -> DrArray:
         """Return the root of every window."""

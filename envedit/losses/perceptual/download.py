@@ -99,7 +99,7 @@ def converted(place: Path) -> dict[str, dict[str, np.ndarray]]:
 def _torchvision(kind: str, table: Mapping[str, Any], member: str) -> dict[str, np.ndarray]:
     """Name the convolutions of Flax, numbered, as torchvision does, their axes in its order (O, I, h, w)."""
     state_dict: dict[str, np.ndarray] = {}
-    layers = [layer for layer in KINDS[kind][1]() if isinstance(layer, Conv)]
+    layers = [layer for layer in KINDS[kind][1] if isinstance(layer, Conv)]
     for i, layer in enumerate(layers):
         convolution = table[f"Conv_{i}"]
         weight = np.ascontiguousarray(convolution["kernel"].transpose(3, 2, 0, 1))

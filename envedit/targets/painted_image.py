@@ -8,7 +8,6 @@ format.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from types import MappingProxyType
 
 import numpy as np
 
@@ -24,7 +23,6 @@ from envedit.targets.strokes import Painted
 NEARLY_ALL = 0.9
 MOST_RESIZED = 16
 """Times as wide, or as narrow, as the rendering that a picture may be: others are no resized exports."""
-NOTHING: Mapping[str, object] = MappingProxyType({})
 
 
 # ----------------------------------------------------------------------------------------------------------
@@ -37,7 +35,7 @@ def read(
     tonemap_name: str,
     initial: np.ndarray | None = None,
     mask: FilePath = "",
-    exported: Mapping[str, object] = NOTHING,
+    exported: Mapping[str, object] = {},
 ) -> Painted:
     """Read a painted picture, for a rendering of ``shape`` (h, w).
 

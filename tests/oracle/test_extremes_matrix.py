@@ -1,4 +1,4 @@
-"""Maps of the matrix through its stages, odd targets and scenes; the page in docs/ says the same.
+"""Maps of the matrix through its stages; the page in docs/ says the same.
 
 Every declared exception is a test, and of the other cells every fifth, so that each map meets a fifth of the
 stages and each stage a fifth of the maps. ``python -m tests.oracles.extremes`` runs them all.
@@ -37,20 +37,6 @@ def sample():
 def test_cell(name, stage, tmp_path):
     outcome = extremes.observe(extremes.STAGES[stage], extremes.MAPS[name], tmp_path)
     extremes.agree(extremes.expected(name, stage), *outcome)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", extremes.TARGETS)
-def test_target(name, tmp_path):
-    act, outcome = extremes.TARGETS[name]
-    extremes.agree(outcome, *extremes.observe(act, tmp_path))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", extremes.SCENES)
-def test_scene(name, tmp_path):
-    act, outcome = extremes.SCENES[name]
-    extremes.agree(outcome, *extremes.observe(act, tmp_path))
 
 
 def test_every_declared_exception_is_a_cell():

@@ -14,7 +14,7 @@ from envedit.core.color import TONEMAPS, tonemap
 from envedit.core.errors import InputError
 from envedit.images import images
 from envedit.targets import initial_rendering, painted_image
-from tests.oracles.builders import chunk, exr, floats, png, with_chunk
+from tests.oracles.builders import exr, floats, png, with_chunk
 
 SIZE = (60, 83)  # no multiple of a JPEG's blocks
 RECTANGLE = (slice(13, 37), slice(21, 50))
@@ -334,6 +334,16 @@ def test_alpha_of_an_exr_is_premultiplied(initial, tmp_path):
     assert not alone.picture[0, 0].any() and "taken as it is" in told(alone)
 
 
+def test_faint_alpha_is_paint_where_it_adds_more_than_a_half_rounds_by(tmp_path):
+    initial = np.full((*SIZE, 3), 0.5, np.float32)
+    alpha = np.full(SIZE, 1e-4, np.float32)
+    found = painted_image.read(floats(tmp_path / "p.exr", 0.1 * initial, A=alpha), SIZE, "gamma", initial)
+    np.testing.assert_allclose(found.coverage, 1e-4, rtol=1e-6)
+    np.testing.assert_allclose(found.picture, 1.0999 * initial, rtol=1e-5)
+    faint = floats(tmp_path / "p.exr", 2e-4 * initial, A=alpha)
+    refused(["nothing of it is painted"], faint, SIZE, "gamma", initial)
+
+
 def test_a_cropped_exr_is_not_black_paint(initial, tmp_path):
     part = brushed(initial)[0][10:40, 15:60]
     box = {"dataWindow": ((15, 10), (59, 39)), "displayWindow": ((0, 0), (82, 59))}
@@ -378,19 +388,6 @@ def test_grey(kind, initial, tmp_path):
     assert "read as grey" in told(found) and "transparent" not in told(found)
     refused(["is grey", "RGB"], file, SIZE, "gamma", initial)
     assert painted_image.read(file, SIZE, "gamma").coverage.all()
-
-
-def test_palette_with_transparency(tmp_path):
-    head = struct.pack(">IIBBBBB", 3, 2, 8, 3, 0, 0, 0)
-    colours = bytes([10, 20, 30, 200, 100, 50])
-    rows = b"\0" + bytes([0, 1, 0]) + b"\0" + bytes([1, 1, 0])
-    parts = [(b"IHDR", head), (b"PLTE", colours), (b"tRNS", b"\xff\0"), (b"IDAT", zlib.compress(rows))]
-    data = b"".join(chunk(*part) for part in parts)
-    (tmp_path / "p.png").write_bytes(b"\x89PNG\r\n\x1a\n" + data + chunk(b"IEND", b""))
-    initial = np.full((2, 3, 3), 0.5, np.float32)
-    found = painted_image.read(tmp_path / "p.png", (2, 3), "linear", initial)
-    np.testing.assert_array_equal(found.coverage[..., 0], [[1, 0, 1], [0, 0, 1]])
-    np.testing.assert_allclose(found.picture[0, 0] * 255, [10, 20, 30], rtol=1e-6)
 
 
 def test_cmyk_and_another_size_are_refused(initial, tmp_path):

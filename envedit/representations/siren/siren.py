@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import mitsuba as mi
@@ -15,6 +16,7 @@ from envedit.core.types import Params
 from envedit.representations.siren import fit
 
 
+@dataclass(eq=False)
 class Siren:
     """The weights of a SIREN fitted to the image (Eq. 1-3); robust (R-SIREN) when fitted with awp_gamma > 0.
 
@@ -24,35 +26,25 @@ class Siren:
     by.
     """
 
+    network: config.Representation
+    settings: config.Fit
+    folder: Path | None = None
+    progress: Callable[[int, int, float], None] | None = None
+    rows: tuple[int, int] | None = None
+    fitted: fit.Fitted | None = field(default=None, init=False)
+    factor: np.ndarray = field(default_factory=lambda: np.ones(3), init=False)
+
     lr = 5e-5
     models_edit, separation = False, None
 
-    def __init__(
-        self,
-        network: config.Representation,
-        settings: config.Fit,
-        folder: Path | None = None,
-        progress: Callable[[int, int, float], None] | None = None,
-        rows: tuple[int, int] | None = None,
-    ):
-        self.network = network
-        self.settings = settings
-        self.folder = folder
-        self.progress = progress
-        self.fitted: fit.Fitted | None = None
-        self.factor = np.ones(3)
-        self._rows = rows
-        self._shape: tuple[int, int] | None = None
-        self._points: mi.TensorXf | None = None
-
     def encode(self, image: np.ndarray, seed: int = 0) -> Params:
         """Fit the network, or take an earlier fit of the same image from disk."""
-        require_radiance(image, "siren", (self._rows or (0,))[0], BRIGHTEST)
+        require_radiance(image, "siren", (self.rows or (0,))[0], BRIGHTEST)
         self.fitted = fit.fit(
-            image, self.network, self.settings, seed, self._rows, folder=self.folder, progress=self.progress
+            image, self.network, self.settings, seed, self.rows, folder=self.folder, progress=self.progress
         )
         self._shape = image.shape[:2]
-        self._points = fit.points(self.network, self._shape, self._rows)
+        self._points = fit.points(self.network, self._shape, self.rows)
         return {name: tensor(value) for name, value in self.fitted.params.items()}
 
     def decode(self, params: Params) -> mi.TensorXf:

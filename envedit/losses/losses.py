@@ -30,8 +30,7 @@ CHANGE_FLOOR = 0.01
 def image_l1(x: Tensor, reference: Tensor, weight: Tensor | None = None) -> DrArray:
     """Compute the mean absolute error of two images ``(H, W, C)``: also the last term of Eq. 4, of radiance.
 
-    The subgradient where they are equal is 0. Squared, that term is 1e5 times the logarithmic ones on a map
-    with a sun. InputError if the shapes differ or the weight does not fit.
+    The subgradient where they are equal is 0. InputError if the shapes differ or the weight does not fit.
     """
     check_pair(x, reference)
     return _mean(dr.abs(x.array - reference.array), x.shape, weight)
@@ -47,8 +46,7 @@ def luminance(x: Tensor, reference: Tensor) -> DrArray:
     r"""Compare total luminance, ``|Lum(E) - Lum(E')|`` (Eq. 8) of RGB images; InputError for others.
 
     ``Lum(E) = sum of 0.2126 R + 0.7152 G + 0.0722 B`` over texels (Eq. 7), not weighted by solid angle, as
-    in the paper. The subgradient where the sums are equal is 0. Both sums and their difference are taken in
-    double precision.
+    in the paper. The subgradient where the sums are equal is 0.
     """
     check_pair(x, reference)
     if x.shape[2] != 3:
@@ -64,10 +62,7 @@ def _luminance_sum(x):
 
 
 def l1(x: Tensor, reference: Tensor | None = None) -> DrArray:
-    """Sum ``|E|`` over texels and channels (Eq. 9): a sum, not a mean; ``reference`` is not used.
-
-    The subgradient at 0 is 0.
-    """
+    """Sum ``|E|`` over texels and channels (Eq. 9); ``reference`` is not used, the subgradient at 0 is 0."""
     check_image(x, "image")
     return type(x.array)(total(dr.abs(x.array)))
 
@@ -94,9 +89,9 @@ def tv(x: Tensor, reference: Tensor | None = None) -> DrArray:
 def change(x: Tensor, reference: Tensor) -> DrArray:
     """Compare the logarithms of two maps: mean of sqrt(d^2 + s^2) - s, d = log((x + e) / (reference + e)).
 
-    About the mean factor by which texels were changed: a sun that moves counts as a few texels, a sky that
-    takes on another colour as many. s is :data:`CHANGE_SOFT`, e :data:`CHANGE_FLOOR` of the mean of the
-    reference. Arguments and errors as `image_l1`; x must not be negative.
+    A sun that moves counts as a few texels, a sky that takes on another colour as many. s is
+    :data:`CHANGE_SOFT`, e :data:`CHANGE_FLOOR` of the mean of the reference. Errors as of `image_l1`; x must
+    not be negative.
     """
     check_pair(x, reference)
     values = type(x.array)

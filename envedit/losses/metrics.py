@@ -188,16 +188,13 @@ def painted(
 ) -> dict:
     """Measure how far a painted picture was followed, and how still the rest was held.
 
-    On display values d, with coverage c in [0, 1], means over pixels and channels. The result's rendering,
-    the painted picture and what it was painted on (h, w, 3) are linear radiance; ``coverage`` (h, w, 1) is
-    how much each pixel was painted, and ``seen`` (h, w) which pixels count. ``noise`` (h, w) is the standard
-    error of the result's display values under "gamma"; that of the initial rendering, which is in the target
-    as well, is taken to be the same.
+    The result's rendering, the painted picture and what it was painted on (h, w, 3) are linear radiance;
+    ``coverage`` c (h, w, 1) is how much each pixel was painted, in [0, 1], and ``seen`` (h, w) which pixels
+    count. ``noise`` (h, w) is the standard error of the display values of both renderings under "gamma".
 
-    Returns ``towards``: 1 - sum c |edited - target| / sum c |initial - target|, None where nothing was asked,
-    or less than noise leaves of it where it is followed exactly: the mean of |x - y| is 2 / sqrt(pi) times
-    the noise of each; and ``elsewhere``: mean of |edited - initial| weighted by 1 - c, None where all was
-    painted.
+    Returns, of display values, ``towards``: 1 - sum c |edited - target| / sum c |initial - target|, None
+    where that was to change by less than the noise, of which the mean of |x - y| is 2 / sqrt(pi); and
+    ``elsewhere``: mean of |edited - initial| weighted by 1 - c, None where all was painted.
     """
     edited, target = _pair(edited, target)
     _, initial = _pair(edited, initial)
@@ -290,7 +287,7 @@ def high_frequency_energy(image: np.ndarray) -> float:
 
     The high pass is ``log(max(L, 0) + LOG_EPS)`` of the luminance L minus its 5 x 5 binomial blur
     (1, 4, 6, 4, 1) / 16 on either axis; columns are periodic, the outermost rows repeat. Independent noise of
-    variance s^2 gives 0.794 s^2 (squared taps: 1 - 2 (6/16)^2 + (70/256)^2), a smooth gradient about 0.
+    variance s^2 gives 0.794 s^2, a smooth gradient about 0.
     """
     values = _log(luminance(checked(image, "image")))
     height, width = values.shape

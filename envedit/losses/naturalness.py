@@ -66,8 +66,7 @@ def patches(edited: np.ndarray, original: np.ndarray) -> float:
     """Return the RMS of the log gain of the upper half at scales of 11 to 60 degrees.
 
     The gain is that of mean luminance in cells, with the brightest :data:`CLIPPED` of each map cut, less its
-    Gaussian mean of :data:`COARSE_DEGREES`: one factor for the sky leaves nothing, a gradient over all of it
-    some 60 % of its own RMS.
+    Gaussian mean of :data:`COARSE_DEGREES`.
     """
     (before, directions, omega) = cells(original)
     (after, _, _) = cells(edited)

@@ -36,8 +36,8 @@ def blend(first: np.ndarray, second: np.ndarray, amount: float) -> tuple[np.ndar
     """Blend two maps of one size.
 
     ``first`` and ``second`` (H, W, 3) float32 are linear radiance in Rec. 709. Both are overwritten: two maps
-    of 8192 x 4096 texels are 0.8 GB. At an ``amount`` of 1 the second is returned, below 1 the first,
-    overwritten; with it ``direction`` and ``flux`` of each light of the result, none where it is the second.
+    of 8192 x 4096 texels are 0.8 GB. Returns the blended map, at an ``amount`` of 1 the second, and
+    ``direction`` and ``flux`` of each light of it, none of the second.
     """
     if amount >= 1:
         return second, []

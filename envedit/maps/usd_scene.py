@@ -30,11 +30,11 @@ def text(
 ) -> str:
     """Return a stage (``.usda``) that is lit by a map.
 
-    The files are the map, and the map without its ``lights``, by names relative to the stage; the lights have
-    ``direction``, ``angle`` and ``flux`` as of :func:`.light_list.listed`. ``to_world`` (3, 3) rotates from
-    the map's frame (+y up) to the scene's; ``scale`` is what the scene multiplies the files' values by.
-    ``below`` is the scene's USD file, relative to the stage, which becomes a layer above it, and its
-    ``stage`` as of :class:`.conversion.Converted`: its domes are switched off. None: lights alone.
+    The files are the map, and the map without its ``lights`` (:func:`.light_list.listed`), by names relative
+    to the stage. ``to_world`` (3, 3) rotates from the map's frame (+y up) to the scene's; ``scale`` is what
+    the scene multiplies the files' values by. ``below`` is the scene's USD file, relative to the stage, which
+    becomes a layer above it, and its ``stage`` as of :class:`.conversion.Converted`, whose domes are switched
+    off. None: lights alone.
     """
     # ---- Layer metadata
     rotation = np.eye(3) if to_world is None else np.asarray(to_world, np.float64)

@@ -2,9 +2,7 @@
 
 Light differs between the two, outlines do not. What is compared are the directions of the edges of log
 luminance without their sign, weighted by how clear they are: z = m e^(2 i phi), of a gradient of direction
-phi and size g, with m = g / (g + g_0). The rendering is that under light from everywhere, which casts no
-shadows. A coarse search correlates all shifts at once, by Fourier transforms, at scales and rotations on a
-grid; then every parameter is refined in turn.
+phi and size g, with m = g / (g + g_0). The rendering is that under light from everywhere: without shadows.
 """
 
 from __future__ import annotations

@@ -66,8 +66,8 @@ def export_tonemap(file: FilePath, picture: np.ndarray, settings: config.Config)
 def png_tonemap(picture: np.ndarray, settings: config.Config) -> str:
     """Return the tonemap of a PNG of a rendering (h, w, 3): [target] tonemap where it names one.
 
-    With "auto" it is "gamma" where that clips less than :data:`CLIPPED` of the pixels, which have no
-    information when they come back, and otherwise "reinhard", which clips nothing below a radiance of 10^4.
+    With "auto" it is "gamma" where that clips less than :data:`CLIPPED` of the pixels, and otherwise
+    "reinhard", which clips nothing below a radiance of 10^4.
     """
     chosen = settings.target
     if chosen.tonemap != "auto" or _clipped(tonemap(picture, chosen.display_tonemap)) < CLIPPED:

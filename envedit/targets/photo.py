@@ -220,11 +220,10 @@ def read(
 ) -> tuple[Photo, list[str]]:
     """Read a photograph and lay it on the film of a rendering; returns it, and warnings.
 
-    ``file`` is OpenEXR, Radiance, PNG or JPEG, ``mask`` likewise, of the photograph's size and white where it
-    counts; "" for none. ``outlines`` (h, w, 3) is the scene under light from everywhere, linear radiance.
-    With ``align`` it is found how the photograph is shifted, scaled and rotated; otherwise it lies as it is.
-    By ``vignetting`` stops its corners are darker than a lens without would make them: with r the distance
-    from the centre over that of the corners, v = 2^(-vignetting r^2). Its camera changes nothing.
+    ``mask`` is a file of the photograph's size, white where it counts; "" for none. ``outlines`` (h, w, 3) is
+    the scene under light from everywhere, linear radiance. With ``align`` it is found how the photograph is
+    shifted, scaled and rotated. By ``vignetting`` stops its corners are darker: with r the distance from the
+    centre over that of the corners, v = 2^(-vignetting r^2). Its camera changes nothing.
 
     InputError if a file cannot be read, is of another aspect, is not finite, or lies farther off than is
     looked for.

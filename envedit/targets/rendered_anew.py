@@ -1,10 +1,9 @@
 """A picture of the scene under other light, made by a renderer: how it differs from paint, and its noise.
 
-Who paints on a rendering keeps its Monte Carlo noise, also where colour or contrast of all of it is changed.
-A picture that was rendered anew has noise of its own. With A the rendering that could have been painted on, B
-another one of the same map with other samples, and h a high-pass filter, the sums over pixels of
-|h(picture) - h(A)|^2 and |h(picture) - h(B)|^2 are then equally large but for chance, as A and B can be
-exchanged.
+Who paints on a rendering keeps its Monte Carlo noise; a picture that was rendered anew has noise of its own.
+With A the rendering that could have been painted on, B another one of the same map with other samples, and h
+a high-pass filter, the sums over pixels of |h(picture) - h(A)|^2 and |h(picture) - h(B)|^2 are then equally
+large but for chance.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """The size at which an edit is solved: that of the target, or fewer pixels where these say as much.
 
-Neighbouring pixels err together, and a smooth change of the sky shows in all of them: of a large picture the
-solver sees the same scene on a smaller film. What is judged in the end is rendered at full size. A mirror
-shows detail of the sky in every single pixel, and is worked on as it is.
+A smooth change of the sky shows in all pixels of an object: of a large picture the solver sees the same scene
+on a smaller film. A mirror shows detail of the sky in every single pixel, and is worked on as it is. The
+result is rendered at full size.
 """
 
 from __future__ import annotations

@@ -78,7 +78,6 @@ class Dists:
 
     alpha and beta divided by the sum of both. As these then sum to 1, this is evaluated as the sum of
     ``alpha (mu_x - mu_y)^2 / (mu_x^2 + mu_y^2 + c1) + beta var_(x - y) / (var_x + var_y + c2)``.
-    Any image of at least one pixel will do.
 
     The backbone is VGG16, the weights' file an ``npz`` with ``alpha`` and ``beta``, each (1, 1475, 1, 1);
     errors as of :func:`.weights.read`.
@@ -102,10 +101,7 @@ class Dists:
         ]
 
     def against(self, reference: Tensor) -> Callable[[Tensor], DrArray]:
-        """Return the distance to an image ``(H, W, 3)`` as a callable: ``x -> size-1 array``, differentiable.
-
-        InputError if it is no image, or gradients are expected of it.
-        """
+        """Return the distance to an image ``(H, W, 3)``: ``x -> size-1 array``, differentiable in x."""
         return _DistsTo(self, reference)
 
     def __call__(self, x: Tensor, reference: Tensor) -> DrArray:
@@ -196,10 +192,9 @@ def _variances(values, mean):
 class Lpips:
     """LPIPS v0.1: how different two images look to features that were calibrated on people's judgements.
 
-    Zhang et al. 2018 ("The unreasonable effectiveness of deep features as a perceptual metric",
-    Eq. 1), as in the authors' PyTorch code, version 0.1: features of every tapped layer, divided by
-    their length at each pixel; squared differences, weighted by channel, averaged over pixels, summed
-    over layers. Images in [0, 1] are mapped to [-1, 1] first, which is the authors' ``normalize=True``.
+    Zhang et al. 2018 ("The unreasonable effectiveness of deep features as a perceptual metric", Eq. 1), as in
+    the authors' PyTorch code with ``normalize=True``: features of every tapped layer, divided by their length
+    at each pixel; squared differences, weighted by channel, averaged over pixels, summed over layers.
 
     ``kind`` is "alex" or "vgg", ``backbone`` the network or its file (`Backbone.load`), the heads' file an
     ``npz`` with ``lin0.model.1.weight`` (1, C, 1, 1) and so on, one for every layer; errors as of

@@ -196,37 +196,35 @@ class Objective:
         return dr.detach(loss), dr.grad(y)
 
 
-class Perturbation:
-    """Adversarial weight perturbation (Eq. 5, Algorithm 1) of the weight matrices.
+# ---- Adversarial weight perturbation (Eq. 5, Algorithm 1) --------------------------------------------------
+
+
+def ascent(grads: Params, lr: float) -> Params:
+    """Return the direction, for every weight matrix, in which a loss of these gradients becomes worse.
 
     The proxy Adam of the paper takes one step from an offset of zero, so that the direction is not the
     rounding error of two nearly equal weights. Its learning rate cancels in the normalisation but for Adam's
     epsilon. It is made anew every time, as Algorithm 1 shows no state.
     """
+    matrices = {name: grad for name, grad in grads.items() if name.endswith(".weight")}
+    proxy = optimizer.Adam({name: dr.zeros(mi.TensorXf, grad.shape) for name, grad in matrices.items()}, lr)
+    # A refused (non-finite) gradient leaves the direction at zero: no perturbation in this epoch.
+    proxy.step({name: -grad for name, grad in matrices.items()})
+    return proxy.params
 
-    def __init__(self, params: Params, gamma: float):
-        self.gamma = gamma
-        self.names = [name for name in params if name.endswith(".weight")]
-        self._zeros = {name: dr.opaque(dr.zeros(mi.TensorXf, params[name].shape)) for name in self.names}
-        self._direction: Params | None = None
 
-    def update(self, grads: Params, lr: float) -> None:
-        """Set the direction of ascent from a gradient of the loss that is to be made worse."""
-        proxy = optimizer.Adam(self._zeros, lr)
-        # A refused (non-finite) gradient leaves the direction at zero: no perturbation in this epoch.
-        proxy.step({name: -grads[name] for name in self.names})
-        self._direction = proxy.params
+def perturbed(params: Params, direction: Params, gamma: float) -> Params:
+    """Return parameters moved by gamma of their norm; a layer without direction or norm stays as it is."""
+    out = dict(params)
+    for name, d in direction.items():
+        norm, norm_of_d = (dr.sqrt(dr.sum(dr.square(x.array))) for x in (params[name], d))
+        length = norm * dr.rcp(norm_of_d + 1e-20)
+        out[name] = params[name] + mi.TensorXf(gamma * length * d.array, d.shape)
+    dr.eval(out)
+    return out
 
-    def apply(self, params: Params) -> Params:
-        """Return perturbed parameters; a layer without direction or of zero norm stays as it is."""
-        out = dict(params)
-        for name in self.names:
-            d = self._direction[name]
-            norm, norm_of_d = (dr.sqrt(dr.sum(dr.square(x.array))) for x in (params[name], d))
-            length = norm * dr.rcp(norm_of_d + 1e-20)
-            out[name] = params[name] + mi.TensorXf(self.gamma * length * d.array, d.shape)
-        dr.eval(out)
-        return out
+
+# ---- Training ----------------------------------------------------------------------------------------------
 
 
 def learning_rate(settings: config.Fit, base: float, epoch: int) -> float:
@@ -244,7 +242,7 @@ def _train(image, normalisation, x, network, settings, seed, begun, progress):
     rng = np.random.default_rng(seed)
     order = list[int]()
     adam = optimizer.Adam(params, settings.lr, (0.9, settings.beta2))
-    perturbation = Perturbation(params, settings.awp_gamma) if settings.awp_gamma > 0 else None
+    direction: Params = {}
     first, refused = begun.restore(adam)
     for epoch in range(settings.epochs):
         order = order or list(rng.permutation(len(grids)))
@@ -252,14 +250,14 @@ def _train(image, normalisation, x, network, settings, seed, begun, progress):
         if epoch < first:  # only the order of the grids is gone through again
             continue
         params = adam.params
-        if perturbation and epoch < settings.awp_until * settings.epochs:
+        if settings.awp_gamma > 0 and epoch < settings.awp_until * settings.epochs:
             if epoch % settings.awp_every == 0:
                 y, tape = siren.forward(params, x, network.omega)
                 _, slope = objective.gradient(y, only_ssim=True)
                 # A rate of 0 at the end of a schedule would leave no direction.
                 rate = max(learning_rate(settings, settings.awp_lr, epoch), 0.01 * settings.awp_lr)
-                perturbation.update(siren.backward(params, tape, slope), rate)
-            params = perturbation.apply(params)
+                direction = ascent(siren.backward(params, tape, slope), rate)
+            params = perturbed(params, direction, settings.awp_gamma)
         y, tape = siren.forward(params, x, network.omega)
         loss, slope = objective.gradient(y)
         rate = learning_rate(settings, settings.lr, epoch)

@@ -14,9 +14,8 @@ import numpy as np
 from envedit.core.arrays import flat
 from envedit.core.errors import NumericalError, place_of
 from envedit.core.rows import Rows
-from envedit.export.moved_lights import MovedLights
 from envedit.export.ratio_transfer import Ratio
-from envedit.export.source_cores import SourceCores
+from envedit.export.source_lights import MovedLights, SourceCores
 from envedit.export.texel_maps import Places
 from envedit.representations.base import Representation
 from envedit.representations.layers import lights

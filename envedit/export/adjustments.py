@@ -128,8 +128,7 @@ def flux_ratio(before: np.ndarray, after: np.ndarray) -> np.ndarray:
 def _soften(envmap, degrees, most):
     """Soften the lights of a map in place and bound what it shows; ``most`` 0: no bound. Returns notes."""
     lights = file_lights.lights_of(envmap)
-    many = f"{len(lights)} light{'s' * (len(lights) != 1)}"
-    notes = [f"{many} softened by {degrees:g} degrees"] if degrees else []
+    notes = [f"{counted(len(lights), 'light', 'lights')} softened by {degrees:g} degrees"] if degrees else []
     if degrees and not lights:
         notes = ["no light was found: lights.soften_degrees changes nothing"]
     file_lights.take_out(envmap, lights)

@@ -1,4 +1,4 @@
-"""The last layer that is solved for: against formulas, a search of all of them, and at its limits."""
+"""The last layer that is solved for: against formulas, and at its limits."""
 
 import drjit as dr
 import mitsuba as mi
@@ -29,22 +29,6 @@ def error(params, x, wanted, light, share):
     return np.sum(weights(light, share) * (y - wanted) ** 2)
 
 
-def slope(params, x, wanted, light, share, h=1e-6):
-    """Gradient of the error in the last layer's weights and biases, by central differences."""
-    start, last = arrays(params), len(params) // 2 - 1
-    out = []
-    for name in (f"{last}.weight", f"{last}.bias"):
-        for at in np.ndindex(start[name].shape):
-            ends = []
-            for step in (h, -h):
-                moved = start[name].copy()
-                moved[at] += step
-                y = numpy_forward(start | {name: moved}, x.numpy(), OMEGA)
-                ends.append(np.sum(weights(light, share) * (y - wanted) ** 2))
-            out.append((ends[0] - ends[1]) / (2 * h))
-    return np.array(out)
-
-
 def problem(rng, points=200, hidden=8, depth=1, inputs=3):
     """Return a network, points, values within (0, 1), and their light: a few points hold most of it."""
     params, x = siren.init(4, hidden, depth, OMEGA, inputs), own(rng.uniform(-1, 1, (points, inputs)))
@@ -59,18 +43,6 @@ def again(params, times, x, wanted, light, share):
     return params
 
 
-@pytest.mark.parametrize("share", [0.0, 1.0, 30.0])
-def test_the_solution_is_where_the_weighted_error_is_level(share, rng):
-    params, x, wanted, light = problem(rng)
-    given = x, wanted, light, share
-    solved = again(params, 8, *given)
-    assert error(solved, *given) < 0.95 * error(params, *given)
-    assert np.linalg.norm(slope(solved, *given)) < 1e-4 * np.linalg.norm(slope(params, *given))
-    # Control: it is not level for another weight of the light.
-    other = x, wanted, light, share + 5
-    assert np.linalg.norm(slope(solved, *other)) > 1e-3 * np.linalg.norm(slope(params, *other))
-
-
 @pytest.mark.parametrize("share", [0.0, 1.0, 7.5])
 def test_points_that_cannot_be_told_apart_get_their_weighted_mean(share):
     """All features alike: the output is one number, sum(w y) / sum(w), channel by channel."""
@@ -83,6 +55,19 @@ def test_points_that_cannot_be_told_apart_get_their_weighted_mean(share):
     expected = np.sum(w * wanted, axis=0) / np.sum(w, axis=0)
     got = siren.forward(solved, siren.coordinates(1, 3), OMEGA)[0].numpy()
     np.testing.assert_allclose(got, np.broadcast_to(expected, (3, 3)), atol=1e-5)
+
+
+def test_a_last_layer_that_explains_everything_is_found(rng):
+    params, x, _, light = problem(rng, points=300, hidden=6)
+    truth = params | {"2.weight": own(0.3 * rng.normal(size=(3, 6))), "2.bias": own([0.4, -0.3, 0.1])}
+    wanted = numpy_forward(arrays(truth), x.numpy(), OMEGA)
+    solved = output_layer.last_layer(params, x, OMEGA, wanted, light, 1.0)
+    given = x, wanted, light, 1.0
+    # Two steps of Newton: what is left is squared twice, but for the damping.
+    assert error(solved, *given) < 1e-3 * error(params, *given)
+    solved = again(solved, 4, *given)
+    for name in ("2.weight", "2.bias"):
+        np.testing.assert_allclose(solved[name].numpy(), truth[name].numpy(), atol=1e-4)
 
 
 def test_all_but_the_last_layer_stays_and_the_order_of_the_parameters(rng):

@@ -69,52 +69,28 @@ def _plain(lines):
     return all(line.isprintable() and len(line) < 1000 for line in lines)
 
 
-def _each(*calls):
-    """Call all, and raise the first error that a user may see."""
-    errors = []
-    for call in calls:
-        try:
-            call()
-        except EnveditError as error:
-            errors.append(error)
-    if errors:
-        raise errors[0]
-
-
 # ---- readers -----------------------------------------------------------------------------------------------
 
 
 def read_map(path: Path, index: int) -> None:
     """Read as a picture with alpha, and as the map to edit."""
-
-    def stored():
-        pixels, info = images.read_stored(path)
-        _demand(pixels.ndim == 3 and pixels.shape[1::-1] == info["size"], f"shape {pixels.shape}")
-
-    def to_edit():
-        found, info = images.load_envmap(path, 16, repair=bool(index % 2))
-        _demand(found.shape == (8, 16, 3) and found.dtype == np.float32, f"shape {found.shape}")
-        # A file may hold values whose mean float32 cannot; then the map must be refused, not infinite.
-        _demand(np.isfinite(found).all() and (found >= 0).all(), "a map that is not finite, or negative")
-        _demand(_plain(info["warnings"]), f"warnings {info['warnings']!r:.200}")
-
-    _each(stored, to_edit)
+    pixels, info = images.read_stored(path)
+    _demand(pixels.ndim == 3 and pixels.shape[1::-1] == info["size"], f"shape {pixels.shape}")
+    found, info = images.load_envmap(path, 16, repair=bool(index % 2))
+    _demand(found.shape == (8, 16, 3) and found.dtype == np.float32, f"shape {found.shape}")
+    # A file may hold values whose mean float32 cannot; then the map must be refused, not infinite.
+    _demand(np.isfinite(found).all() and (found >= 0).all(), "a map that is not finite, or negative")
+    _demand(_plain(info["warnings"]), f"warnings {info['warnings']!r:.200}")
 
 
 def read_painted(path: Path, index: int) -> None:
-    """Read as a painted picture, with and without the rendering it was painted on, and as a mask."""
+    """Read as a painted picture, with or without the rendering it was painted on, and as a mask."""
     initial = np.clip(whole.radiance(), 0, 1) if index % 2 else None
-
-    def look(*values):
-        _demand(all(v.shape[:2] == whole.SIZE and np.isfinite(v).all() for v in values), "not finite")
-        _demand(all(v.dtype == np.float32 and (v >= 0).all() for v in values), "negative")
-
-    def painted():
-        found = painted_image.read(path, whole.SIZE, "gamma", initial)
-        look(found.picture, found.coverage)
-        _demand(_plain(found.warnings), f"warnings {found!r:.200}")
-
-    _each(painted, lambda: look(painted_image.read_mask(path, whole.SIZE)))
+    found = painted_image.read(path, whole.SIZE, "gamma", initial)
+    _demand(_plain(found.warnings), f"warnings {found!r:.200}")
+    for values in (found.picture, found.coverage, painted_image.read_mask(path, whole.SIZE)):
+        _demand(values.shape[:2] == whole.SIZE and values.dtype == np.float32, f"shape {values.shape}")
+        _demand(np.isfinite(values).all() and (values >= 0).all(), "not finite, or negative")
 
 
 def read_configuration(path: Path, index: int) -> None:

@@ -1,24 +1,23 @@
-"""A process that reads damaged files, one after another, and reports how each went.
+"""A process that reads damaged files, one after another, and how each went."""
 
-Started by :class:`.drive.Worker` with the name of a kind of files, or ``module:function``. Requests on stdin
-and answers on stdout are a line of JSON each. A crash ends it by a signal, a hang by SIGPROF: the parent sees
-either.
-"""
-
-import importlib
-import json
+import contextlib
+import faulthandler
+import multiprocessing
 import os
 import resource
 import signal
 import sys
+import tempfile
 import warnings
+from collections.abc import Callable
 from pathlib import Path
+from unittest import mock
 
 import mitsuba as mi
 
 from envedit.core.errors import ConfigError, InputError
 
-from .kinds import KINDS, WrongError
+from .kinds import WrongError
 
 MIB = 1 << 20
 MULTIPLE, ROOM = 8, 64 * MIB
@@ -27,60 +26,136 @@ ADDRESS_ROOM = 512 * MIB
 """Address space beyond the multiple: pools and stacks of threads take it, and do not touch it."""
 MOST_ADDRESS = 8192 * MIB
 LONGEST_MESSAGE = 600
+ALLOCATOR = {"MALLOC_PERTURB_": "165", "MALLOC_MMAP_THRESHOLD_": "65536"}
+"""Freed memory is overwritten, so that its use is seen; large blocks go back to the system at once."""
 
 
-def cpu_limit(declared: int, least: float = 5.0) -> float:
+def cpu_limit(declared: int, least: float) -> float:
     """Seconds of processor time, all threads together, after which a case counts as hung."""
     return min(least + declared / (20 * MIB), 120)
 
 
-def main(reader: str, answers) -> None:
-    """Answer requests, as :meth:`.drive.Worker.read` makes them, until stdin ends."""
+class Worker:
+    """The process, started anew when a file has ended it.
+
+    ``reader`` is a function (path, index) of a module, ``seconds`` the processor time that a small file may
+    take, ``patience`` the wall time, for each second of processor time that a case has, after which it is
+    stuck.
+    """
+
+    def __init__(self, reader: Callable[[Path, int], None], seconds: float = 5.0, patience: float = 20.0):
+        self.reader = reader
+        self.seconds = seconds
+        self.patience = patience
+        self.process = None
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.stop()
+
+    def _start(self):
+        self.printed = tempfile.NamedTemporaryFile()  # noqa: SIM115 it lives as long as the process
+        spawn = multiprocessing.get_context("spawn")
+        self.connection, other = spawn.Pipe()
+        asked = (self.reader, other, self.printed.name)
+        self.process = spawn.Process(target=_serve, args=asked, daemon=True)
+        with mock.patch.dict(os.environ, ALLOCATOR):
+            self.process.start()
+        other.close()
+        self.connection.recv()  # it is ready: starting counts for no file
+
+    def stop(self) -> None:
+        """End the process."""
+        if self.process is not None:
+            self.process.kill()
+            self.process.join()
+            self.connection.close()
+            self.printed.close()
+            self.process = None
+
+    def read(self, path: Path, index: int, declared: int, limited: bool = True) -> dict:
+        """Have a file read; returns its ``outcome``, ``error`` and ``peak`` bytes of memory."""
+        if self.process is None:
+            self._start()
+        seconds = cpu_limit(declared, self.seconds)
+        wait = self.patience * seconds
+        with contextlib.suppress(EOFError, ConnectionError):
+            self.connection.send((path, index, declared, seconds, limited))
+            if not self.connection.poll(wait):
+                self.stop()
+                return {"outcome": "hung", "error": f"no answer in {wait:.0f} s of wall time"}
+            return self.connection.recv()
+        self.process.join()
+        code = self.process.exitcode
+        said = Path(self.printed.name).read_text(errors="replace")[-1500:]
+        self.stop()
+        if code == -signal.SIGPROF:
+            return {"outcome": "hung", "error": f"{seconds:g} s of processor time\n{said}"}
+        name = signal.Signals(-code).name if code < 0 else f"exit code {code}"
+        return {"outcome": "crashed", "error": f"{name}\n{said}"}
+
+
+# ---- in the process ----------------------------------------------------------------------------------------
+
+
+def _serve(reader, connection, printed: str) -> None:
+    """Answer requests of :meth:`Worker.read`; what anything prints goes to the file ``printed``."""
+    with open(printed, "ab") as file:
+        os.dup2(file.fileno(), 1)
+        os.dup2(file.fileno(), 2)
+    faulthandler.enable(file=2)
     mi.set_variant("llvm_ad_rgb")
     mi.set_log_level(mi.LogLevel.Error)
-    module, _, function = reader.partition(":")
-    read = getattr(importlib.import_module(module), function) if function else KINDS[reader].read
     warnings.simplefilter("always")  # each is a line on a user's terminal
+    connection.send("ready")
+    while True:
+        connection.send(_limited(reader, printed, *connection.recv()))
+
+
+def _limited(reader, printed, path, index, declared, seconds, limited) -> dict:
+    """Call a reader within its limits; returns how it went, with the ``peak`` of memory."""
+    before = os.path.getsize(printed)
+    Path("/proc/self/clear_refs").write_text("5")  # the peak is what is resident now
+    start = _status("VmRSS")
+    room = min(ADDRESS_ROOM + MULTIPLE * declared, MOST_ADDRESS)
     hard = resource.getrlimit(resource.RLIMIT_AS)[1]
-    answers.write("ready\n")
-    answers.flush()
-    for line in sys.stdin:
-        request = json.loads(line)
-        path = Path(request["path"])
-        declared = request["declared"]
-        printed = os.fstat(2).st_size
-        start = _reset_peak()
-        room = min(ADDRESS_ROOM + MULTIPLE * declared, MOST_ADDRESS)
-        if request["limited"]:
-            resource.setrlimit(resource.RLIMIT_AS, (_status("VmSize") + room, hard))
-        signal.setitimer(signal.ITIMER_PROF, request["seconds"])  # its default action ends the process
-        try:
-            answer = judged(read, path, request["index"])
-        finally:
-            signal.setitimer(signal.ITIMER_PROF, 0)
-            resource.setrlimit(resource.RLIMIT_AS, (hard, hard))
-        sys.stdout.flush()
-        sys.stderr.flush()
-        answer["peak"] = _status("VmHWM") - start
-        if answer["peak"] > ROOM + MULTIPLE * declared:
-            error = f"{answer['peak'] >> 20} MiB for {declared} bytes declared"
-            answer |= {"outcome": "memory", "error": error}
-        elif "not enough memory" in answer.get("error", "") and room < MOST_ADDRESS:
-            answer["outcome"] = "memory"
-        elif answer["outcome"] in ("read", "refused") and os.fstat(2).st_size > printed:
-            answer |= {"outcome": "printed", "error": os.pread(2, 500, printed).decode(errors="replace")}
-        answers.write(json.dumps(answer) + "\n")
-        answers.flush()
+    if limited:
+        resource.setrlimit(resource.RLIMIT_AS, (_status("VmSize") + room, hard))
+    signal.setitimer(signal.ITIMER_PROF, seconds)  # its default action ends the process
+    try:
+        answer = judged(reader, path, index)
+    finally:
+        signal.setitimer(signal.ITIMER_PROF, 0)
+        resource.setrlimit(resource.RLIMIT_AS, (hard, hard))
+    sys.stdout.flush()
+    answer["peak"] = _status("VmHWM") - start
+    if answer["peak"] > ROOM + MULTIPLE * declared:
+        error = f"{answer['peak'] >> 20} MiB for {declared} bytes declared"
+        return answer | {"outcome": "memory", "error": error}
+    if "not enough memory" in answer.get("error", "") and room < MOST_ADDRESS:
+        return answer | {"outcome": "memory"}
+    said = Path(printed).read_bytes()[before:]
+    if said and answer["outcome"] in ("read", "refused"):
+        return answer | {"outcome": "printed", "error": said[:500].decode(errors="replace")}
+    return answer
 
 
-def judged(read, path: Path, index: int) -> dict:
+def _status(key):
+    """Return a field of /proc/self/status in bytes."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) * 1024 for line in lines if line.startswith(f"{key}:"))
+
+
+def judged(reader, path: Path, index: int) -> dict:
     """Call a reader and say how it went: "read", "refused", "unclear", "wrong" or "traceback"."""
     try:
-        read(path, index)
+        reader(path, index)
         return {"outcome": "read"}
     except (ConfigError, InputError) as error:
         fault = unclear(str(error), str(path))
-        said = f"{fault}{error}"[:2000].encode("utf-8", "replace").decode()
+        said = f"{fault}{error}"[:2000]
         return {"outcome": "unclear" if fault else "refused", "kind": type(error).__name__, "error": said}
     except WrongError as error:
         return {"outcome": "wrong", "error": str(error)}
@@ -98,22 +173,3 @@ def unclear(message: str, path: str) -> str:
     if not all(line.isprintable() for line in lines):
         return "it holds control characters: "
     return ""
-
-
-def _status(key):
-    """Return a field of /proc/self/status in bytes."""
-    with open("/proc/self/status") as file:
-        return next(int(line.split()[1]) * 1024 for line in file if line.startswith(f"{key}:"))
-
-
-def _reset_peak():
-    """Set the peak of resident memory to what is resident now, and return that."""
-    with open("/proc/self/clear_refs", "w") as file:
-        file.write("5")
-    return _status("VmRSS")
-
-
-if __name__ == "__main__":
-    own = os.fdopen(os.dup(1), "w")
-    os.dup2(2, 1)  # what anything prints counts against it
-    main(sys.argv[1], own)

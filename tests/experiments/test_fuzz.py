@@ -1,15 +1,22 @@
 """Damaged files of every kind end well; and the harness sees each way in which they could end badly."""
 
 import argparse
+import ctypes
+import os
 import struct
 import sys
+import time
+import warnings
 
 import numpy as np
 import pytest
 
 from envedit.config import Config
-from experiments.fuzz import damage, drive, experiment, kinds, whole
+from envedit.core.errors import InputError
+from envedit.images import images
+from experiments.fuzz import damage, experiment, kinds, whole
 from experiments.fuzz.declared import declared as declared_bytes
+from experiments.fuzz.worker import Worker
 from experiments.harness import Case, Done, rows_of, table
 
 linux = pytest.mark.skipif(sys.platform != "linux", reason="memory of a process is read from /proc")
@@ -23,7 +30,7 @@ linux = pytest.mark.skipif(sys.platform != "linux", reason="memory of a process 
     ("checkpoint", 40),
 ])  # fmt: skip
 def test_damaged_files_are_read_or_refused(what, cases, tmp_path):
-    found = drive.piece(Config(), tmp_path, what, 0, cases)
+    found = experiment.piece(Config(), tmp_path, what, 0, cases)
     counts, errors = found["counts"], found["errors"]
     assert not found["faults"] and not list(tmp_path.iterdir())
     assert counts["read"] + counts["refused"] == cases
@@ -39,7 +46,7 @@ def test_damaged_files_are_read_or_refused(what, cases, tmp_path):
 @pytest.fixture(scope="module")
 def reader():
     """A worker that reads maps and painted pictures."""
-    with drive.Worker("map") as process:
+    with Worker(kinds.read_map) as process:
         yield process
 
 
@@ -48,24 +55,19 @@ def reader():
 @pytest.mark.parametrize("name", ["ours.exr", "flat.hdr", "rgb8.png"])
 def test_a_whole_image_takes_no_more_than_the_stated_multiple(tmp_path, name, reader):
     """Here without the room that small files have, so that the multiple itself is tested."""
-    shape = (512, 1024)
+    height, width = 512, 1024
     if name == "ours.exr":
-        from envedit.images import images
-
         images.write_exr(tmp_path / name, np.tile(whole.radiance(), (32, 32, 1)))
     elif name == "flat.hdr":
         pixels = np.tile(whole.shared_exponent(), (32, 32, 1))
         (tmp_path / name).write_bytes(b"#?RADIANCE\n\n-Y 512 +X 1024\n" + pixels.tobytes())
     else:
         (tmp_path / name).write_bytes(whole.png(np.tile(whole.codes(), (32, 32, 1)), 2))
-    data = (tmp_path / name).read_bytes()
-    declared = declared_bytes(data)
-    assert declared >= 12 * shape[0] * shape[1]
-    small = {"ours.exr": "map", "flat.hdr": "map", "rgb8.png": "painted"}[name]
-    for warm, raw in kinds.seeds(small):
-        if warm == name:
-            (tmp_path / f"small-{name}").write_bytes(raw)
-            reader.read(tmp_path / f"small-{name}", 0, len(raw), limited=False)
+    declared = declared_bytes((tmp_path / name).read_bytes())
+    assert declared >= 12 * height * width
+    small = tmp_path / f"small-{name}"  # a first file takes memory that later ones do not
+    small.write_bytes((whole.maps() | whole.painted_files())[name])
+    reader.read(small, 0, 0, limited=False)
     answer = reader.read(tmp_path / name, 0, declared)
     assert answer["outcome"] == "read", answer
     assert declared / 2 < answer["peak"] < 8 * declared
@@ -87,55 +89,68 @@ def test_an_image_two_billion_texels_wide_takes_no_memory(tmp_path, field, reade
 
 # ---- the harness -------------------------------------------------------------------------------------------
 
-BAD = """
-import ctypes, os, sys, time, warnings
-from envedit.core.errors import InputError
-from experiments.fuzz.kinds import WrongError
 
-def read(path, index):
-    kind = path.read_text()
-    if kind == "crashed":
-        ctypes.string_at(0)
-    elif kind == "hung":
-        while True:
-            pass
-    elif kind == "stuck":
-        time.sleep(60)
-    elif kind == "traceback":
-        {}["key"]
-    elif kind == "nameless":
-        raise InputError("cannot be read")
-    elif kind == "control":
-        raise InputError(f"{path}: \\x1b[31m")
-    elif kind == "lengthy":
-        raise InputError(f"{path}: " + 1000 * "a")
-    elif kind == "wrong":
-        raise WrongError("not finite")
-    elif kind == "memory":
-        bytearray(b"1") * (100 << 20)
-    elif kind == "address":
-        try:
-            bytearray(1 << 30)
-        except MemoryError:
-            raise InputError(f"{path}: not enough memory")
-    elif kind == "printed":
-        os.write(1, b"from C")
-    elif kind == "warned":
-        warnings.warn("from Python")
-    elif kind == "refused":
-        raise InputError(f"{path}: damaged")
-"""
+def refusing(text):
+    """Return a reader that refuses a file by a message."""
+
+    def reader(path):
+        raise InputError(text.format(path=path))
+
+    return reader
+
+
+def hung(path):
+    while True:
+        pass
+
+
+def wrong(path):
+    raise kinds.WrongError("not finite")
+
+
+def address(path):
+    try:
+        bytearray(1 << 30)
+    except MemoryError:
+        raise InputError(f"{path}: not enough memory") from None
+
+
+BAD = {
+    "crashed": lambda path: ctypes.string_at(0),
+    "hung": hung,
+    "stuck": lambda path: time.sleep(60),
+    "traceback": lambda path: {}["key"],
+    "nameless": refusing("cannot be read"),
+    "control": refusing("{path}: \x1b[31m"),
+    "lengthy": refusing("{path}: " + 1000 * "a"),
+    "wrong": wrong,
+    "memory": lambda path: bytearray(b"1") * (100 << 20),
+    "address": address,
+    "printed": lambda path: os.write(1, b"from C"),
+    "warned": lambda path: warnings.warn("from Python", stacklevel=1),
+    "refused": refusing("{path}: damaged"),
+}
+"""Readers by what they do."""
+
+
+def bad(path, index):
+    """A reader that does what a file says."""
+    BAD[path.read_text()](path)
+
+
+def bad_by_index(path, index):
+    """A reader that fails at two cases and at a whole file."""
+    if index == 1 or (index == experiment.WHOLE and path.name == "new.hdr"):
+        raise KeyError("a")
+    if index == 2:
+        os.abort()
 
 
 @pytest.fixture(scope="module")
-def bad_reader(tmp_path_factory):
-    """A worker whose reader does what a file says; it has minutes on the clock."""
-    folder = tmp_path_factory.mktemp("bad")
-    (folder / "bad.py").write_text(BAD)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PYTHONPATH", str(folder))
-        with drive.Worker("bad:read", seconds=0.5, patience=240) as process:
-            yield process
+def bad_reader():
+    """A worker with minutes on the clock."""
+    with Worker(bad, seconds=0.5, patience=240) as process:
+        yield process
 
 
 @pytest.mark.slow
@@ -161,33 +176,16 @@ def test_every_fault_is_seen(tmp_path, monkeypatch, kind, outcome, words, bad_re
 
 @pytest.mark.slow
 @linux
-def test_failing_cases_are_kept_and_counted(tmp_path, monkeypatch):
-    (tmp_path / "bad.py").write_text(
-        "def read(path, index):\n    if index == 1:\n        raise KeyError('a')\n    if index == 2:\n"
-        "        import os\n        os.abort()\n"
-    )
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    (kept := tmp_path / "kept").mkdir()
-    found = drive.piece(Config(), kept, "map", 0, 4, reader="bad:read")
-    assert [(i, o) for i, o, _ in found["faults"]] == [(1, "traceback"), (2, "crashed")]
+def test_failing_cases_are_kept_and_counted(tmp_path):
+    found = experiment.piece(Config(), tmp_path, "map", 0, 4, reader=bad_by_index)
+    unread = ("new.hdr", "traceback")  # before the first case, and by the process that takes the place of one
+    faults = [(i, outcome) for i, outcome, _ in found["faults"]]
+    assert faults == [unread, (1, "traceback"), (2, "crashed"), unread]
     assert dict(found["counts"]) == {"read": 2, "traceback": 1, "crashed": 1}
     name, data = kinds.case("map", kinds.seeds("map"), 0, 2)
-    assert len(list(kept.iterdir())) == 4
-    assert (kept / f"2-crashed-{name}").read_bytes() == data
-    assert "SIGABRT" in (kept / f"2-crashed-{name}.txt").read_text()
-
-
-@pytest.mark.slow
-@linux
-def test_a_whole_file_that_is_not_read_is_a_fault(tmp_path, monkeypatch):
-    (tmp_path / "bad.py").write_text(
-        f"def read(path, index):\n    if index == {drive.WHOLE} and path.name == 'new.hdr':\n"
-        "        raise KeyError('a')\n"
-    )
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    found = drive.piece(Config(), tmp_path, "map", 0, 2, reader="bad:read")
-    assert [(name, outcome) for name, outcome, _ in found["faults"]] == [("new.hdr", "traceback")]
-    assert dict(found["counts"]) == {"read": 2}
+    assert len(list(tmp_path.iterdir())) == 4
+    assert (tmp_path / f"2-crashed-{name}").read_bytes() == data
+    assert "SIGABRT" in (tmp_path / f"2-crashed-{name}.txt").read_text()
 
 
 def test_a_case_is_the_same_file_every_time():

@@ -26,6 +26,7 @@ import contextlib
 import functools
 import hashlib
 import inspect
+import itertools
 import json
 import re
 import sys
@@ -124,6 +125,10 @@ class Done:
         """Read ``NAME.exr``, linear radiance (H, W, 3)."""
         return images.read(str(self.folder / f"{name}.exr"))[0]
 
+    def shown(self, *names: str) -> list[np.ndarray]:
+        """Read ``NAME.exr`` of several names as display values."""
+        return [tonemap(self.picture(name), "gamma") for name in names]
+
     @cached_property
     def maps(self) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
         """Original, edited and true map; None for a target without one, or where its file is gone."""
@@ -158,9 +163,8 @@ def layer(folder: Path, name: str) -> np.ndarray:
 def edit_panels(done: Done) -> list[np.ndarray]:
     """Return original, true and edited map, target and edited rendering as display values."""
     original, edited, true = done.maps
-    shown = [original, np.zeros_like(original) if true is None else true, edited]
-    shown += [done.picture("render_target"), done.picture("render_edited")]
-    return [tonemap(one, "gamma") for one in shown]
+    maps = [original, np.zeros_like(original) if true is None else true, edited]
+    return [tonemap(one, "gamma") for one in maps] + done.shown("render_target", "render_edited")
 
 
 @dataclass(frozen=True)
@@ -183,6 +187,8 @@ class Experiment:
     panels: Callable[[Done], list[np.ndarray]] = edit_panels
     sheet: Callable[[Case], str] = lambda case: "sheet.jpg"  # name of its file; without ending: a PNG
     options: Callable[[argparse.ArgumentParser], None] = lambda parser: None  # adds the experiment's own
+    # Kind of a case and its rank there, as one tuple; adds --count N: so many cases, of each kind in turn
+    place: Callable[[Case], tuple] | None = None
     # In place of panels: all cases with their jobs, folders of runs and sheets, command line -> files
     draw: Callable[[list, Path, Path, argparse.Namespace], list[Path]] | None = None
     file: Callable[[argparse.Namespace], str] = lambda given: "table"  # the table's file, without ending
@@ -190,6 +196,20 @@ class Experiment:
 
 
 # ---- running -----------------------------------------------------------------------------------------------
+
+
+def chosen(experiment: Experiment, given: argparse.Namespace) -> list[Case]:
+    """Return the cases that the command line asks for: those of ``--only``, and of these ``--count``."""
+    cases = experiment.cases(given)
+    if given.only:
+        cases = [case for case in cases if any(text in case.name for text in given.only)]
+    if experiment.place and given.count is not None:
+        kinds: dict[Any, list[Case]] = {}
+        for case in sorted(cases, key=experiment.place):
+            kinds.setdefault(experiment.place(case)[0], []).append(case)
+        rounds = itertools.zip_longest(*kinds.values())
+        cases = [case for some in rounds for case in some if case is not None][: given.count]
+    return cases
 
 
 def done_of(cases: Iterable[tuple[Case, sweep.Job]], out: Path) -> list[Done]:
@@ -305,6 +325,8 @@ def main(name: str, about: str, experiment: Experiment, argv: Sequence[str] | No
     )
     add_options(parser, Path("runs") / name)
     parser.add_argument("--to", type=Path, metavar="DIR", help="of table.md and sheets (that of the runs)")
+    if experiment.place:
+        parser.add_argument("--count", type=int, metavar="N", help="so many cases, evenly from all kinds")
     experiment.options(parser)
     given = parser.parse_args(argv)
     options.check_options(parser, given)
@@ -316,15 +338,10 @@ def main(name: str, about: str, experiment: Experiment, argv: Sequence[str] | No
 def _act(name, experiment, given):
     mi.set_variant(config.Config().variant)
     out = given.out.absolute()
-    chosen = [
-        case
-        for case in experiment.cases(given)
-        if not given.only or any(text in case.name for text in given.only)
-    ]
-    if not chosen:
+    cases = [(case, case.job(given.sets)) for case in chosen(experiment, given)]
+    if not cases:
         got = f"--only {' '.join(given.only)}: " if given.only else ""
         raise ConfigError(f"{got}no case of {name} is left; give other options")
-    cases = [(case, case.job(given.sets)) for case in chosen]
     missing = []
     if given.action == "run":
         outcomes = carry_out(cases, out, given, sys.stderr)

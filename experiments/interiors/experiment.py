@@ -11,7 +11,6 @@ import numpy as np
 
 from envedit.core import latlong
 from envedit.core.atomic_files import make_folder
-from envedit.core.color import tonemap
 from envedit.images import images
 from experiments import puresky
 from experiments.harness import Case, Done, Experiment, edit_panels
@@ -117,7 +116,7 @@ def panels(done: Done):
     """Return original, true and edited map; what was asked for, and the edited rendering."""
     shown = edit_panels(done)
     if done.maps[2] is None:  # painted: what it was painted on
-        shown[1] = tonemap(done.picture("render_initial"), "gamma")
+        shown[1:2] = done.shown("render_initial")
     return shown
 
 

@@ -30,10 +30,6 @@ ELEVATIONS, ELEVATION = (5, 10, 20, 50, 65, 80), 35
 WIDTH = 256
 
 
-def options(parser):
-    parser.add_argument("--count", type=int, help="so many cases, evenly from all kinds of them")
-
-
 def cases(args):
     skies = {name: str(file) for name, file in puresky.find().items()}
     names = sorted(skies)
@@ -69,28 +65,14 @@ def cases(args):
             }
             about = {"scene": scene, "map": name, "label": label, "kind": kind, "turn": word}
             made.append(Case(f"{scene}-{name}-{label}-turn_{word}", configuration, about))
-    return picked(made, args)
+    return made
 
 
-def picked(made: list[Case], args, kinds: tuple[str, ...] = ("kind", "turn", "scene")) -> list[Case]:
-    """Return the cases that ``--only`` names; with ``--count``, so many of them, evenly from all kinds.
-
-    Cases are of one kind if they agree in ``kinds``. The order is always the same.
-    """
-    made = [case for case in made if not args.only or any(text in case.name for text in args.only)]
-    if args.count is None:
-        return made
-    strata: dict[tuple, list[Case]] = {}
-    for case in sorted(made, key=lambda c: _digest(c.name)):
-        strata.setdefault(tuple(case.about[key] for key in kinds), []).append(case)
-    # Neighbours in a round differ in all of what distinguishes their kinds.
-    keys = sorted(strata, key=lambda key: _digest(str(key)))
-    rounds = itertools.zip_longest(*(strata[key] for key in keys))
-    return [case for some in rounds for case in some if case is not None][: args.count]
-
-
-def _digest(text):
-    return hashlib.sha256(text.encode()).hexdigest()
+def place(case: Case, kinds: tuple[str, ...] = ("kind", "turn", "scene")) -> tuple[str, str]:
+    """Return digests: neighbours in a round of cases differ in all of what distinguishes their kinds."""
+    kind = str(tuple(case.about[key] for key in kinds))
+    digests = [hashlib.sha256(text.encode()).hexdigest() for text in (kind, case.name)]
+    return digests[0], digests[1]
 
 
 def gained(done: Done, part: slice) -> float | None:
@@ -156,5 +138,5 @@ EXPERIMENT = Experiment(
     COLUMNS,
     summary=lambda rows: "\n\n".join(Summary(by, STATISTICS)(rows) for by in GROUPS),
     sheet=lambda case: case.about["scene"] + ".jpg",
-    options=options,
+    place=place,
 )

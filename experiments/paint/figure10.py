@@ -224,8 +224,8 @@ def cases(given):
 def saved_panels(done: Done) -> list[np.ndarray]:
     """Return rendering before, painted and saved, and the map before and after."""
     saved = Done(done.case, done.folder / "work/edit_out")
-    shown = [saved.picture(f"render_{name}") for name in ("initial", "target", "edited")]
-    return [tonemap(one, "gamma") for one in (*shown, *saved.maps[:2])]
+    maps = [tonemap(one, "gamma") for one in saved.maps[:2]]
+    return saved.shown("render_initial", "render_target", "render_edited") + maps
 
 
 def panels(done: Done) -> list[np.ndarray]:

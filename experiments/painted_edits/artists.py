@@ -13,7 +13,7 @@ from envedit import inputs
 from envedit.core.color import tonemap
 from envedit.targets import initial_rendering
 from experiments import puresky
-from experiments.harness import Case, Done, Experiment, calling
+from experiments.harness import Done, Experiment, calling
 from experiments.measures import degrees
 from experiments.natural.skies import KEPT
 from experiments.painted_edits import one_light
@@ -40,7 +40,6 @@ EDIT = "edit"
 
 
 def options(parser):
-    parser.add_argument("--count", type=int, help="so many cases, evenly from all edits")
     rooms = "under the maps of ENVEDIT_DATA/hdri, most of which have several lights, in place of skies"
     parser.add_argument("--rooms", action="store_true", help=rooms)
 
@@ -49,7 +48,7 @@ def cases(args):
     skies = puresky.find() if not args.rooms else {}
     maps = puresky.others() if args.rooms else {name: skies[name] for name in MAPS if name in skies}
     made = []
-    for edit, scene, name in itertools.product(PAINTERS, SCENES, maps):
+    for (i, edit), (j, scene), (k, name) in itertools.product(*map(enumerate, (PAINTERS, SCENES, maps))):
         if name in SHADOWLESS and edit in SHADOWS:
             continue
         tables = {
@@ -57,22 +56,14 @@ def cases(args):
             "scene": puresky.scene(scene) | {"width": WIDTH},
         }
         about = {"edit": edit, "scene": scene, "map": name, "kept": " (kept out)" if name in KEPT else ""}
+        # Scene and map change from one edit to the next.
+        about["place"] = (
+            i,
+            (k - i) % len(maps),
+            (j - i) % len(SCENES),
+        )
         made.append(calling(f"{edit}-{scene}-{name}".replace(" ", "_"), carry_out, tables, about, edit=edit))
-    made = [case for case in made if not args.only or any(text in case.name for text in args.only)]
-    return made if args.count is None else evenly(made, args.count, list(maps))
-
-
-def evenly(made: list[Case], count: int, maps: list[str]) -> list[Case]:
-    """Pick cases of all edits in the same number; scene and map change from one edit to the next."""
-
-    def late(case):
-        edit, scene, name = (case.about[key] for key in ("edit", "scene", "map"))
-        i = list(PAINTERS).index(edit)
-        return (maps.index(name) - i) % len(maps), (SCENES.index(scene) - i) % len(SCENES)
-
-    of_edits = [sorted((c for c in made if c.about["edit"] == edit), key=late) for edit in PAINTERS]
-    rounds = itertools.zip_longest(*of_edits)
-    return [case for some in rounds for case in some if case is not None][:count]
+    return made
 
 
 def carry_out(settings, folder, edit: str) -> dict:
@@ -116,9 +107,8 @@ def panels(done: Done):
     if not done.metrics:
         return []
     edit = Done(replace(done.case, result="metrics.json"), done.folder / EDIT)  # as `envedit run` leaves it
-    pictures = [edit.picture(f"render_{name}") for name in ("initial", "target", "edited")]
-    original, edited, _ = edit.maps
-    return [tonemap(one, "gamma") for one in (*pictures, original, edited)]
+    maps = [tonemap(one, "gamma") for one in edit.maps[:2]]
+    return edit.shown("render_initial", "render_target", "render_edited") + maps
 
 
 EXPERIMENT = Experiment(
@@ -146,4 +136,5 @@ EXPERIMENT = Experiment(
     panels=panels,
     sheet=lambda case: f"artists_{case.about['scene']}.jpg",
     options=options,
+    place=lambda case: case.about["place"],
 )

@@ -52,10 +52,9 @@ def measure(done: Done) -> dict:
 
 def panels(done: Done):
     """Return initial, painted and edited rendering, what no light can do; original and edited map."""
-    shown = [tonemap(done.picture(f"render_{n}"), "gamma") for n in ("initial", "target", "edited")]
+    shown = done.shown("render_initial", "render_target", "render_edited")
     unreachable, _ = images.read_stored(str(done.folder / "unreachable.png"))
-    original, edited, _ = done.maps
-    return [*shown, unreachable[..., :3] / 255, *(tonemap(m, "gamma") for m in (original, edited))]
+    return [*shown, unreachable[..., :3] / 255, *(tonemap(one, "gamma") for one in done.maps[:2])]
 
 
 PAINT = {

@@ -11,7 +11,7 @@ import numpy as np
 import envedit
 from envedit import config
 from envedit.core import latlong
-from envedit.core.color import luminance, tonemap
+from envedit.core.color import luminance
 from envedit.images import images
 from envedit.targets.photo import Camera
 from experiments import puresky
@@ -202,8 +202,8 @@ SUMMARY = Summary(
 
 def panels(done: Done):
     """Return the rendering where there is one, edited and true map."""
-    names = [name for name in ("render", "edited", "true") if (done.folder / f"{name}.exr").exists()]
-    return [tonemap(done.picture(name), "gamma") for name in names]
+    names = ("render", "edited", "true")
+    return done.shown(*(name for name in names if (done.folder / f"{name}.exr").exists()))
 
 
 EXPERIMENT = Experiment(

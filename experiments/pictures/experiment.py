@@ -11,12 +11,11 @@ import mitsuba as mi
 
 import envedit
 from envedit import config, inputs
-from envedit.core.color import tonemap
 from envedit.images import images
 from experiments import puresky
 from experiments.harness import Done, Experiment, calling
 from experiments.measures import psnr
-from experiments.natural.experiment import picked
+from experiments.natural.experiment import place
 from experiments.plain_mitsuba import loaded
 from experiments.summary import Summary
 
@@ -46,10 +45,6 @@ WAYS = {"by_map": "map", "by_picture": "linear picture", "by_png": "PNG"}
 """How the target is given, by the name of its files."""
 
 
-def options(parser):
-    parser.add_argument("--count", type=int, help="so many cases, evenly from scenes, pairs and turns")
-
-
 def cases(given):
     maps = puresky.find()
     targets = [(name, f"turned by {turn}", {"rotate_degrees": float(turn)}) for name, turn in TURNS.items()]
@@ -67,7 +62,7 @@ def cases(given):
         about = {"scene": scene, "map": name, "target": label, "kind": kind}
         title = f"{scene}-{name}-{label}".replace(" ", "_")
         found.append(calling(title, three_ways, tables, about))
-    return picked(found, given, ("kind", "scene"))
+    return found
 
 
 def three_ways(settings, folder) -> dict:
@@ -145,8 +140,7 @@ STATISTICS = Summary(
 
 def panels(done: Done):
     """Return original and true map, the edited ones, and the renderings."""
-    maps = [done.picture(name) for name in ("original", "true", *WAYS)]
-    return [tonemap(one, "gamma") for one in (*maps, *(done.picture(f"render_{way}") for way in WAYS))]
+    return done.shown("original", "true", *WAYS, *(f"render_{way}" for way in WAYS))
 
 
 EXPERIMENT = Experiment(
@@ -165,5 +159,5 @@ EXPERIMENT = Experiment(
     summary=summary,
     panels=panels,
     sheet=lambda case: f"{case.about['scene']}.jpg",
-    options=options,
+    place=lambda case: place(case, ("kind", "scene")),
 )

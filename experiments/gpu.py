@@ -19,7 +19,6 @@ import contextlib
 import json
 import os
 import platform
-import signal
 import subprocess
 import sys
 import tempfile
@@ -74,20 +73,6 @@ def result(step: str, folder: str, printed: str) -> dict[str, Any]:
     return {"psnr": quality, "iterations": metrics["iterations"], "timing": metrics["timing"]}
 
 
-def called(command: list[str], left: float) -> tuple[int | None, str, str]:
-    """Run a command; returns its exit code, None if time was over, and what it printed on both streams."""
-    pipe = subprocess.PIPE
-    with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, start_new_session=True) as child:
-        try:
-            printed, errors = child.communicate(timeout=max(left, 0))
-        except subprocess.TimeoutExpired:
-            return None, "", ""
-        finally:
-            with contextlib.suppress(ProcessLookupError):
-                os.killpg(child.pid, signal.SIGKILL)  # with what it has started
-    return child.returncode, printed, errors
-
-
 def measured(step: str, variant: str, left: float, small: bool = False) -> dict[str, Any]:
     """Carry out a step within seconds; a failure is an ``error`` among what was measured.
 
@@ -97,13 +82,15 @@ def measured(step: str, variant: str, left: float, small: bool = False) -> dict[
     with tempfile.TemporaryDirectory() as folder:
         for command in commands(step, variant, folder, small):
             begun = time.perf_counter()
-            code, printed, errors = called(command, end - time.monotonic())
-            if code is None:
+            try:
+                rest = max(end - time.monotonic(), 0)
+                ran = subprocess.run(command, capture_output=True, text=True, timeout=rest)
+            except subprocess.TimeoutExpired:
                 return {"error": f"not done after {left:.0f} s"}
-            if code:
-                lines = (errors or printed).strip().splitlines() or ["no message"]
-                return {"error": f"exit code {code}: {'; '.join(lines[-2:])[:300]}"}
-        return result(step, folder, printed) | {"wall_s": time.perf_counter() - begun}
+            if ran.returncode:
+                lines = (ran.stderr or ran.stdout).strip().splitlines() or ["no message"]
+                return {"error": f"exit code {ran.returncode}: {'; '.join(lines[-2:])[:300]}"}
+        return result(step, folder, ran.stdout) | {"wall_s": time.perf_counter() - begun}
 
 
 def machine() -> dict[str, Any]:

@@ -9,10 +9,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from envedit import config
+from envedit import config, inputs
 from envedit.core.resampling import fit
 from envedit.images import images
-from experiments.plain_mitsuba import loaded
+from experiments.plain_mitsuba import loaded, relit
 
 STEPS, SPP, RATE = 150, 16, 0.05
 
@@ -24,10 +24,9 @@ def edited_by_adam(settings: config.Config, envmap: np.ndarray, photo: Path) -> 
     square of the difference, by log radiance.
     """
     # ---- Scene and target
-    chosen = settings.scene
-    file = photo.with_name("start.xml")
-    scene, params = loaded(chosen, envmap, file, chosen.width, chosen.width)
-    target = mi.TensorXf(fit(images.read(str(photo))[0], chosen.width, chosen.width))
+    like = inputs.load_scene(settings.scene)
+    scene, params = loaded(relit(settings.scene, envmap, photo.with_name("start.xml")), like)
+    target = mi.TensorXf(fit(images.read(str(photo))[0], like.height, like.width))
     target *= dr.mean(mi.render(scene, spp=64).array) / dr.mean(target.array)
 
     # ---- Steps

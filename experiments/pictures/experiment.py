@@ -16,7 +16,7 @@ from experiments import puresky
 from experiments.harness import Done, Experiment, calling
 from experiments.measures import psnr
 from experiments.natural.experiment import place
-from experiments.plain_mitsuba import loaded
+from experiments.plain_mitsuba import loaded, relit
 from experiments.summary import Summary
 
 SCENES = ("sphere", "statue", "matpreview")
@@ -102,9 +102,8 @@ def write_png(settings, folder, true, file) -> None:
 
     The map is in the units of the radiance that reaches the scene.
     """
-    size = inputs.load_scene(settings.scene)
-    file_of_scene = folder / "true.xml"
-    scene, _ = loaded(settings.scene, true, file_of_scene, size.width, size.height)
+    file_of_scene = relit(settings.scene, true, folder / "true.xml")
+    scene, _ = loaded(file_of_scene, inputs.load_scene(settings.scene))
     rendering = mi.Bitmap(mi.render(scene, spp=PNG_SPP, seed=PNG_SEED))
     shown = rendering.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.UInt8, srgb_gamma=True)
     shown.write(str(file))

@@ -5,17 +5,15 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from envedit import config, inputs, pipeline
 from envedit.core import shipped
 from envedit.core.errors import EnveditError, InputError
-from envedit.core.quiet_libraries import quiet_libraries
-from envedit.scene import parser, scene
-from envedit.scene.film import threads
+from envedit.scene import scene
 from experiments.harness import Done, Experiment, calling
+from experiments.plain_mitsuba import loaded
 from experiments.summary import Summary, values
 
 WIDTH, MAP = 64, 128
@@ -91,25 +89,17 @@ def plain(lit: scene.Scene, settings: config.Config, given: inputs.InputMap, fol
 
     Without a light of its own, the file that a run would leave.
     """
-    file = settings.scene.file
+    file = Path(settings.scene.file)
     filled = {key: str(value) for key, value in settings.scene.parameters.items()}
-    with threads(max(2, dr.thread_count())), quiet_libraries():  # with one thread, files are waited for
-        if given.source == inputs.SUNSKY:
-            file = str(folder / "lit.xml")
-            filled = {}
-            mi.Bitmap(given.stored).write(str(folder / "sky.exr"))
-            text = scene.relit(settings.scene.file, "sky.exr", dict(settings.scene.parameters))
-            Path(file).write_text(text)
-        whole = parser.called(Path(file).name, mi.load_file, file, **filled)
-        params = mi.traverse(whole)
-        ours = lit.mi.sensors()[0].film()
-        sizes = {"size": ours.size(), "crop_size": ours.crop_size(), "crop_offset": ours.crop_offset()}
-        film = next(key for key, _ in params if key.endswith("film.size")).removesuffix("size")
-        for key, value in sizes.items():
-            params[f"{film}{key}"] = value
-        params.update()
-        pictures = (mi.render(whole, sensor=0, spp=SPP, seed=100 + k) for k in range(RENDERINGS))
-        return [float(np.array(picture)[..., :3].mean(dtype=np.float64)) for picture in pictures]
+    if given.source == inputs.SUNSKY:
+        text = scene.relit(file, "sky.exr", dict(settings.scene.parameters))
+        mi.Bitmap(given.stored).write(str(folder / "sky.exr"))
+        filled = {}
+        file = folder / "lit.xml"
+        file.write_text(text)
+    whole, _ = loaded(file, lit, **filled)
+    pictures = (mi.render(whole, sensor=0, spp=SPP, seed=100 + k) for k in range(RENDERINGS))
+    return [float(np.array(picture)[..., :3].mean(dtype=np.float64)) for picture in pictures]
 
 
 def measure(done: Done) -> dict:

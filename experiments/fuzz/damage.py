@@ -32,21 +32,51 @@ def times(rng) -> range:
     return range(rng.integers(1, 4) if rng.random() < 0.5 else 1)
 
 
+def changed(parts, words, rng: np.random.Generator, longest: float) -> None:
+    """Change bytes, or a list of tokens, in one of eight ways; words are what may take a part's place.
+
+    Pieces have up to ``longest`` parts.
+    """
+    size = len(parts)
+    start = int(rng.integers(size))
+    stop = min(start + int(longest ** rng.random()), size)
+    match rng.integers(8):
+        case 0 | 1:
+            parts[start : start + 1] = one_of(words, rng)
+        case 2:
+            parts[start:start] = one_of(words, rng)
+        case 3:
+            del parts[start:stop]
+        case 4:
+            del parts[start:]
+        case 5 | 6:  # repeat a part thousands of times, or a piece up to 128 times
+            piece = parts[start:stop] if rng.random() < 0.5 else parts[start : start + 1]
+            count = int(2 ** rng.uniform(0, 7 if len(piece) > 1 else 17))
+            weight = len(piece) if isinstance(piece, bytearray) else sum(map(len, piece))
+            parts[start:start] = piece * min(count, MOST_BYTES // weight)
+        case 7:  # move a piece over another
+            place = int(rng.integers(size))
+            parts[place : place + stop - start] = parts[start:stop]
+
+
 # ---- bytes -------------------------------------------------------------------------------------------------
 
 
 def of_bytes(data: bytes, rng: np.random.Generator) -> bytes:
     """Return a damaged copy of a file.
 
-    Half of the copies have one to three numbers replaced, the others one to three of: bits turned, bytes set,
-    the end cut off, bytes inserted, a byte stretched to thousands, a piece removed, doubled, moved or zeroed.
-    In half of the PNGs the chunks get correct checksums again, so that the damage is not found at the door.
+    Half of the copies have one to three numbers replaced, or bits turned near the head, the others one to
+    three of the ways of :func:`changed`. In half of the PNGs the chunks get correct checksums again, so that
+    the damage is not found at the door.
     """
     raw = bytearray(data)
-    change = _set_number if rng.random() < 0.5 else _change_bytes
+    words = (b"\0", b"\t", b"\n", b" ", b"\x7f", b"\x80", b"\xff", bytes(200), rng.bytes(1), rng.bytes(300))
+    numbers = rng.random() < 0.5
     for _ in times(rng):
-        if raw:
-            change(raw, rng)
+        if raw and numbers:
+            _set_number(raw, rng)
+        elif raw:
+            changed(raw, words, rng, longest=512)
     if raw.startswith(b"\x89PNG") and rng.random() < 0.5:
         for at, length in png_chunks(raw):
             end = at + 8 + length
@@ -64,7 +94,7 @@ def png_chunks(data: bytes):
 
 
 def _set_number(raw, rng):
-    """Replace a decimal number, or bytes near either end as one number."""
+    """Replace a decimal number, or bytes near either end as one number, or turn one of its bits."""
     digits = list(re.finditer(rb"(?<=[\s(,:=\[])\d+(?=[\s),:\]])", bytes(raw)))
     if digits and rng.random() < 0.4:
         found = one_of(digits, rng)
@@ -76,37 +106,9 @@ def _set_number(raw, rng):
         at = len(raw) - 1 - int(rng.integers(min(len(raw), TAIL)))
     order = one_of(("little", "big"), rng)
     old = int.from_bytes(raw[at : at + size], order)
-    value = one_of((*NUMBERS, old + 1, old - 1, 2 * old, int(rng.integers(2**63))), rng)
+    bit = old ^ 1 << int(rng.integers(8 * size))
+    value = one_of((*NUMBERS, old + 1, old - 1, 2 * old, bit, bit, bit, int(rng.integers(2**63))), rng)
     raw[at : at + size] = (value % 256**size).to_bytes(size, order)
-
-
-def _change_bytes(raw, rng):
-    """Damage bytes in one of nine ways."""
-    size = len(raw)
-    start = int(rng.integers(size))
-    stop = min(start + int(2 ** rng.uniform(0, 9)), size)
-    match rng.integers(9):
-        case 0:  # headers are a small part of a file, and the more delicate one
-            raw[rng.integers(min(size, HEAD))] ^= 1 << int(rng.integers(8))
-        case 1:
-            raw[start] ^= 1 << int(rng.integers(8))
-        case 2:
-            raw[start] = one_of((0, 1, 9, 10, 13, 32, 127, 128, 254, 255), rng)
-        case 3:
-            del raw[start:]
-        case 4:
-            raw[start:start] = rng.bytes(int(2 ** rng.integers(0, 10)))
-        case 5:  # stretch a byte
-            raw[start:start] = raw[start : start + 1] * int(2 ** rng.uniform(4, 17))
-        case 6:
-            del raw[start:stop]
-        case 7:  # double a piece, up to 128 times
-            raw[start:start] = raw[start:stop] * min(
-                int(2 ** rng.uniform(0, 7)), MOST_BYTES // (stop - start)
-            )
-        case 8:  # move a piece, or zero it
-            at = int(rng.integers(size))
-            raw[at : at + stop - start] = raw[start:stop] if rng.random() < 0.5 else bytes(stop - start)
 
 
 # ---- texts -------------------------------------------------------------------------------------------------
@@ -115,8 +117,8 @@ def _change_bytes(raw, rng):
 class Grammar(NamedTuple):
     """How a text is damaged."""
 
-    token: str  # regular expression of what is replaced, removed, doubled and exchanged
-    words: tuple[str, ...]  # what a token becomes
+    token: str  # regular expression of its parts
+    words: tuple[str, ...]  # what a part becomes
     # What opens, is within, and closes: repeated up to 32,768 times
     nests: tuple[tuple[str, str, str], ...]
 
@@ -124,29 +126,19 @@ class Grammar(NamedTuple):
 def of_text(data: bytes, rng: np.random.Generator, grammar: Grammar) -> bytes:
     """Return a damaged copy of a text.
 
-    A third has its bytes damaged like any file; the others one to three of: tokens replaced, removed,
-    doubled, exchanged, stretched to thousands of characters, nests in their place.
+    A third has its bytes damaged like any file; the others have one to three tokens replaced by words or by
+    nests, or changed as by :func:`changed`.
     """
-    parts = re.split(f"({grammar.token})", data.decode())
-    if len(parts) == 1 or rng.random() < 1 / 3:
+    if rng.random() < 1 / 3:
         return of_bytes(data, rng)
+    parts = [part for part in re.split(f"({grammar.token})", data.decode()) if part]
+    opens, within, closes = one_of(grammar.nests, rng)
+    count = int(2 ** rng.uniform(0, 15))
+    nest = opens * count + within + closes * (count if rng.random() < 0.8 else 0)
+    words = [[word] for word in (*grammar.words, *[nest] * (len(grammar.words) // 4))]
     for _ in times(rng):
-        i, j = (one_of(range(1, len(parts), 2), rng) for _ in range(2))
-        count = int(2 ** rng.uniform(0, 15))
-        match rng.integers(8):
-            case 0 | 1 | 2:
-                parts[i] = one_of(grammar.words, rng)
-            case 3:
-                parts[i] = ""
-            case 4:
-                parts[j] = parts[j] + parts[i]
-            case 5:
-                parts[i], parts[j] = parts[j], parts[i]
-            case 6:
-                parts[i] = (parts[i] or "x") * count
-            case 7:
-                opens, within, closes = one_of(grammar.nests, rng)
-                parts[i] = opens * count + within + closes * (count if rng.random() < 0.8 else 0)
+        if parts:
+            changed(parts, words, rng, longest=16)
     return "".join(parts).encode("utf-8", "surrogateescape")[:MOST_BYTES]
 
 

@@ -216,9 +216,9 @@ KINDS = {
     "painted": Kind(whole.painted_files, read_painted),
     "toml": Kind(whole.toml_files, read_configuration, damaged_configuration),
     "weights": Kind(whole.weight_files, read_weights),
-    "scene": Kind(whole.scene_files, read_scene, damaged_scene),
+    "scene": Kind(lambda: {"written.xml": whole.SCENE.encode()}, read_scene, damaged_scene),
     "asset": Kind(whole.asset_files, read_asset, one_in=10),
-    "entry": Kind(whole.entry_files, read_entry, damaged_entry),
+    "entry": Kind(lambda: {"recording.arrays": whole.recording().read_bytes()}, read_entry, damaged_entry),
     "checkpoint": Kind(whole.checkpoint_files, read_checkpoint, damaged_checkpoint),
 }
 

@@ -14,6 +14,7 @@ import OpenEXR
 
 from envedit import config
 from envedit.config import presets
+from envedit.core import shipped
 from envedit.images import images
 from envedit.scene import scene
 from envedit.solve import checkpoint
@@ -178,25 +179,10 @@ def painted_files() -> dict[str, bytes]:
 
 # ---- configurations ----------------------------------------------------------------------------------------
 
-PAINTED = """
-scene = { file = "statue", parameters = { roughness = 0.5, mesh = "a.ply", smooth = true } }
-input = { envmap = "maps/sky.exr", rows = [0, 40] }
-loss = { ssim = [1.0, 100.0], tv = 1e-3 }
-target.kind = "strokes"
-[[target.strokes]]
-type = "shadow"
-ellipse = [0.5, 0.7, 0.2, 0.1, 15]
-[[target.strokes]]
-type = "light"
-points = [[0.1, 0.2], [0.3, 0.4]]
-width = 0.05
-color = [1.0, 0.8, 0.5]
-"""
-
 
 def toml_files() -> dict[str, bytes]:
-    """Return whole configurations: two by hand, and presets and kinds with every key spelled out."""
-    files = {"painted.toml": PAINTED.encode()}
+    """Return whole configurations: the shipped edits, and presets and kinds with every key spelled out."""
+    files = {file.name: file.read_bytes() for file in (shipped.folder() / "edits").glob("*.toml")}
     files["image.toml"] = '[target]\nkind = "image"\nfile = "é/paint.png"\n'.encode()
     for preset, kind in itertools.product(presets.PRESETS, ("layers", "siren", "pixels")):
         chosen = config.loads(f'representation.kind = "{kind}"', "/maps", "a.toml", preset)
@@ -254,19 +240,8 @@ POINTS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], "<f4")
 FACES = np.array([[0, 1, 2], [0, 1, 3], [1, 2, 3]], "<i4")
 
 
-def scene_files() -> dict[str, bytes]:
-    """Return a scene."""
-    return {"written.xml": SCENE.encode()}
-
-
 def asset_files() -> dict[str, bytes]:
     """Return files that scenes name: meshes of every format, a volume, textures."""
-    textures = {name: data for name, data in painted_files().items() if name[:3] in ("rgb", "q95", "our")}
-    return mesh_files() | textures
-
-
-def mesh_files() -> dict[str, bytes]:
-    """Return whole meshes of every format, and a volume."""
     head = (
         "ply\nformat {} 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
         "element face 3\nproperty list uchar int vertex_indices\nend_header\n"
@@ -306,11 +281,6 @@ def recording() -> Path:
     """Return the file of the light transport's recording in its cache."""
     cache, key = transport()[1]._stored
     return cache._path(key | {"part": "recording"})
-
-
-def entry_files() -> dict[str, bytes]:
-    """Return the entry of a light transport."""
-    return {"recording.arrays": recording().read_bytes()}
 
 
 def checkpoint_files() -> dict[str, bytes]:

@@ -53,7 +53,7 @@ def changed(parts, words, rng: np.random.Generator, longest: float) -> None:
             piece = parts[start:stop] if rng.random() < 0.5 else parts[start : start + 1]
             count = int(2 ** rng.uniform(0, 7 if len(piece) > 1 else 17))
             weight = len(piece) if isinstance(piece, bytearray) else sum(map(len, piece))
-            parts[start:start] = piece * min(count, MOST_BYTES // weight)
+            parts[start:start] = piece * min(count, MOST_BYTES // max(weight, 1))
         case 7:  # move a piece over another
             place = int(rng.integers(size))
             parts[place : place + stop - start] = parts[start:stop]

@@ -5,7 +5,6 @@ Tables share the runs that they have in common.
 
 from __future__ import annotations
 
-import hashlib
 import itertools
 import json
 import tomllib
@@ -55,8 +54,6 @@ KINDS = {
 def options(parser):
     parser.add_argument("name", choices=KINDS, metavar="NAME", help=", ".join(KINDS))
     parser.add_argument("--all-maps", action="store_true", help="where the paper has one map")
-    edits = painted_edits.EDITS
-    parser.add_argument("--edit", choices=edits, default=edits[0], help="of Figure 9 (%(default)s)")
 
 
 def maps_of(args) -> dict[str, Path | str]:
@@ -92,8 +89,8 @@ def asked(args, kind: Kind, roughness: float | None) -> dict:
     # Every run pays for its transport, whichever comes first.
     common = {"output": {"report": False, "full": False}, "renderer": {"cache": False}}
     if not kind.scene:
-        edit = tomllib.loads((painted_edits.FOLDER / f"{args.edit}.toml").read_text(encoding="utf-8"))
-        return edit | common
+        file = painted_edits.FOLDER / f"{painted_edits.EDITS[0]}.toml"
+        return tomllib.loads(file.read_text(encoding="utf-8")) | common
     scene = {"file": kind.scene} | ({} if roughness is None else {"parameters": {"roughness": roughness}})
     target = {"rotate_degrees": DEGREES}
     if args.name == "figure8":
@@ -102,14 +99,12 @@ def asked(args, kind: Kind, roughness: float | None) -> dict:
 
 
 def turned(file: Path, folder: Path) -> Path:
-    """Write a map turned by :data:`DEGREES` to ``NAME-turned-CONTENT.exr``, if missing.
+    """Write a map turned by :data:`DEGREES` to ``NAME-turned.exr``.
 
     All PureSky maps have their sun in the middle: another map alone is not another orientation of the light.
     """
-    content = hashlib.sha256(file.read_bytes()).hexdigest()[:8]
-    path = make_folder(folder.absolute()) / f"{file.stem}-turned-{content}.exr"
-    if not path.exists():
-        images.write_exr(path, latlong.rotate(images.load_envmap(str(file))[0], DEGREES))
+    path = make_folder(folder.absolute()) / f"{file.stem}-turned.exr"
+    images.write_exr(path, latlong.rotate(images.load_envmap(str(file))[0], DEGREES))
     return path
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from envedit.core import latlong
 from experiments import measures
-from experiments.light_estimation import experiment, protocol
+from experiments.light_estimation import protocol
 
 TRUTH = Path(os.environ.get("ENVEDIT_DATA", ".")) / "evaluation" / "ground_truth" / "stylelight"
 """Of DiffusionLight's evaluation, rendered by Blender: the folder ``example`` of its repository."""
@@ -179,14 +179,6 @@ def _unit(v):
 
 
 @pytest.mark.slow
-def test_a_map_is_read_off_its_mirror(mirror):
-    expected = 1 + 0.5 * latlong.directions(HEIGHT, WIDTH).astype(np.float32)
-    found = read_off(protocol.render(mirror, expected))
-    behind = latlong.directions(HEIGHT, WIDTH) @ (-protocol.CAMERA / np.linalg.norm(protocol.CAMERA)) > 0.9
-    assert np.abs(found - expected)[~behind].mean() < 0.002
-
-
-@pytest.mark.slow
 @pytest.mark.skipif(not TRUTH.is_dir(), reason="ENVEDIT_DATA has no evaluation/ground_truth/stylelight")
 @pytest.mark.parametrize("name, most", [("diffuse", 0.15), ("matte silver", 0.13), ("mirror", 0.25)])
 def test_spheres_are_those_of_the_ground_truth(name, most):
@@ -207,18 +199,3 @@ def test_spheres_are_those_of_the_ground_truth(name, most):
     errors = protocol.compared(picture, true)
     assert errors["rmse"] < most and errors["angle"] < 0.75
     assert picture[..., :3].mean() / true[..., :3].mean() == pytest.approx(1, abs=0.012)
-
-
-# ---- Tables ------------------------------------------------------------------------------------------------
-def test_our_rows_stand_beside_the_published_ones():
-    of_spheres = {"rmse": 0.125, "si_rmse": 0.125, "normalised": 0.125, "angle": 0.5}
-    rows = [{"kind": "edited", "sphere": name} | of_spheres for name in (*protocol.SPHERES, "mirror")]
-    of_maps = {"sphere": "", "lights": 0.125, "stops": 0.125, "worst": 0.125}
-    rows += [{"kind": "edited", "peak": peak} | of_maps for peak in (4.0, float("nan"))]
-    rows += [{"kind": "unedited", "peak": None} | of_maps]
-    text = experiment.summary(rows).splitlines()
-    assert text[2] == "| edited | diffuse | 1 | 0.125 | 0.125 | 0.125 | 0.500 |"
-    assert text[4].startswith("| edited | mirror | 2 | 0.125 |")
-    assert text[7] == "| DiffusionLight, a photograph | mirror | 1 | - | 0.660 | - | 4.290 |"
-    assert text[-2].startswith("| edited | 4.00 (4.00), 1 | 0.12 (0.12), 2 |")
-    assert text[-1].startswith("| unedited | - (-), 0 | 0.12 (0.12), 1 |")

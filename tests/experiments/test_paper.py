@@ -12,7 +12,6 @@ from envedit.core.errors import ConfigError, InputError
 from envedit.images import images
 from envedit.losses.perceptual.installed import DISTS_WEIGHT
 from experiments import harness, puresky
-from experiments.__main__ import main
 from experiments.interiors import experiment as interiors
 from experiments.paper.experiment import DEFAULT, EXPERIMENT, KINDS, seconds
 from experiments.paper.published import METRICS, PUBLISHED
@@ -179,24 +178,17 @@ def test_without_maps_an_error_says_where_they_come_from(build, tmp_path, monkey
         puresky.find(tmp_path)
 
 
-# ---- the command line --------------------------------------------------------------------------------------
 # ---- tables and pictures of what is done -------------------------------------------------------------------
 
 SOME = {"psnr": 20.0, "ssim": 0.5, "mse": 0.01, "lpips": None}
 
 
 def finish(out, made, part="", *, numbers=SOME, fit_s=None, cached=False, resumed=False):
-    """Make up what the edits leave that have a part in their names, as far as tables and sheets read it."""
+    """Make up what the edits leave that have a part in their names, as far as tables read it."""
     chosen = [job for case, job in made if part in case.name]
     for job in chosen:
         folder = job.folder(out)
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / "config.toml").write_text(job.toml)
-        edited = np.full((8, 16, 3), 0.5, np.float32)
-        images.write_exr(folder / "edited.exr", edited)
-        images.write_layers(folder / "edited_layers.exr", {"edited": edited, "initial": edited})
-        for name, value in (("target", 0.4), ("edited", 0.7)):
-            images.write_exr(folder / f"render_{name}.exr", np.full((6, 6, 3), value, np.float32))
         timing_fit = 0.2 if cached else fit_s or 0.0
         about = {
             "envmap": numbers,
@@ -259,7 +251,7 @@ def test_averages_are_over_maps_that_are_done_in_every_row(maps, build, tmp_path
 
 
 def test_a_painted_edit_has_no_true_map_to_be_compared_with(tmp_path):
-    cases = EXPERIMENT.cases(Namespace(name="figure9", all_maps=False, edit="warmer"))
+    cases = EXPERIMENT.cases(Namespace(name="figure9", all_maps=False))
     made = [(case, case.job(())) for case in cases if case.name.startswith("ours-lum-l1-sunsky")]
     assert finish(tmp_path, made) == 1
     file = made[0][1].folder(tmp_path) / "metrics.json"
@@ -281,11 +273,3 @@ def test_the_seconds_of_a_fit_are_those_of_the_run_that_made_it(maps, build, tmp
     shown = text(tmp_path, made)
     assert row_of(shown, "R-SIREN HDR + L_reg")[0][-3:] == ["840", "30", "1"]
     assert row_of(shown, "Pixels")[0][-3:] == ["-", "-", "1"]
-
-
-def test_every_roughness_has_its_sheet(maps, build, tmp_path, capsys):
-    made = build("table3", f"ours-layers-{OTHER}")
-    finish(tmp_path, made[:2])
-    assert main(["paper", "sheet", "table3", "--out", str(tmp_path), "--only", f"ours-layers-{OTHER}"]) == 0
-    files = [line.rsplit("/", 1)[1] for line in capsys.readouterr().out.splitlines()]
-    assert files == ["table3-ours-0.0.png", "table3-ours-0.5.png"]

@@ -2,7 +2,6 @@
 
 import random
 import re
-import threading
 import time
 from collections import Counter
 from pathlib import Path
@@ -12,8 +11,16 @@ import numpy as np
 from experiments.harness import Experiment, calling, done_of, figure
 from experiments.paint.figure10 import RENDERED, drag, opened, place, prepared
 
-MEMORY_EVERY_S = 1.0
-BUTTONS = ("add-light", "light-mute", "light-delete", "region-remove", "clear", "shape-polygon")
+BUTTONS = (
+    "undo",
+    "redo",
+    "add-light",
+    "light-mute",
+    "light-delete",
+    "region-remove",
+    "clear",
+    "shape-polygon",
+)
 KEYS = ("b", "1", "5", "[", "]", "Escape", "Enter", "Control+z", "ArrowLeft")
 MOVE_S = 0.03
 LONGEST_PAUSE_S = 2.0
@@ -69,16 +76,6 @@ def region(page, chance):
         drag(page, spots(page, chance, "#map-stack", chance.randrange(2, 6)), MOVE_S)
 
 
-def undo(page, chance):
-    """Take something back."""
-    page.get_by_test_id("undo").click(force=True)
-
-
-def redo(page, chance):
-    """Do it again."""
-    page.get_by_test_id("redo").click(force=True)
-
-
 def button(page, chance):
     """Press a button that can be pressed."""
     pressed = page.get_by_test_id(chance.choice(BUTTONS))
@@ -110,7 +107,7 @@ def reload(page, chance):
     page.wait_for_selector(".handle", state="attached", timeout=120_000)
 
 
-ACTIONS = [stroke] * 6 + [light] * 3 + [region, undo, redo, button, turn, wheel, key, reload]
+ACTIONS = [stroke] * 6 + [light] * 3 + [button] * 3 + [region, turn, wheel, key, reload]
 
 
 def spots(page, chance, name, count) -> list:
@@ -130,26 +127,20 @@ def at_rest_mb(page, process) -> float:
 
 def soak(settings, folder, minutes) -> dict:
     """Use the page for some minutes; the configuration's seed is that of the actions."""
-    chance, done, errors, work = random.Random(settings.seed), Counter(), [], prepared(folder)
-    memory, rest, ended = [], [], threading.Event()
+    chance = random.Random(settings.seed)
+    done = Counter()
+    errors = []
+    memory = []
+    rest = []
+    work = prepared(folder)
     with opened(work) as (page, process):
         page.on("pageerror", lambda error: errors.append(str(error)))
         began = time.monotonic()
-
-        def watch():
-            while not ended.wait(MEMORY_EVERY_S) and process.poll() is None:
+        for half in (1, 2):
+            while time.monotonic() < began + 30 * half * minutes and process.poll() is None:
+                done[act(page, chance)] += 1
                 memory.append([time.monotonic() - began, resident_mb(process)])
-
-        watching = threading.Thread(target=watch)
-        watching.start()
-        try:
-            for half in (1, 2):
-                while time.monotonic() < began + 30 * half * minutes and process.poll() is None:
-                    done[act(page, chance)] += 1
-                rest.append(at_rest_mb(page, process))
-        finally:
-            ended.set()
-            watching.join()
+            rest.append(at_rest_mb(page, process))
         alive = process.poll() is None
     return {
         "minutes": minutes,

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import experiments.__main__ as command
-from envedit import config
 from envedit.core.errors import ConfigError, InputError
 from experiments import harness
+from experiments.download_puresky import MAPS
 from experiments.harness import Case, Done, Experiment, markdown, montage
 
 STUB = (
@@ -135,20 +135,6 @@ def test_user_errors_are_one_line(run, tmp_path):
         Done(Case("x", {}), tmp_path).metrics  # noqa: B018
     with pytest.raises(ConfigError):
         Case("x", {}).job(["seed"])
-
-
-def test_an_override_beats_the_case_and_a_target_file_its_turn():
-    tables = {"seed": 1, "target": {"rotate_degrees": 60.0, "spp": 8}}
-    found = config.loads(Case("x", tables).job(["seed=2", "target.file=/b.exr"]).toml)
-    assert found.seed == 2 and found.target == config.Target(rotate_degrees="auto", spp=8, file="/b.exr")
-    assert tables == {"seed": 1, "target": {"rotate_degrees": 60.0, "spp": 8}}
-
-
-MAPS = [
-    "aristea_wreck", "autumn_field", "evening_road_01", "kloofendal_48d_partly_cloudy", "kloppenheim_06",
-    "mud_road", "overcast_soil", "rustig_koppie", "snow_field", "sunflowers", "syferfontein_18d_clear",
-    "wasteland_clouds",
-]  # fmt: skip
 
 
 @pytest.fixture

@@ -12,6 +12,7 @@ import numpy as np
 from envedit.core import latlong
 from envedit.core.atomic_files import make_folder
 from envedit.images import images
+from envedit.representations.layers.placed_lights import direction
 from experiments import puresky
 from experiments.harness import Case, Done, Experiment, edit_panels
 
@@ -37,11 +38,6 @@ WARM = {
 DARK = {"type": "shadow", "ellipse": [0.68, 0.82, 0.15, 0.06], "amount": 0.4, "softness": 0.05}
 PAINT = [WARM, DARK]
 """A warm light on the sphere, and a shadow on the ground."""
-
-
-def direction(azimuth: float, elevation: float) -> np.ndarray:
-    """Return the unit vector towards a place of the map, degrees."""
-    return latlong.on_sphere(math.radians(90 - elevation), math.radians(azimuth))
 
 
 def room(lamps: dict[str, tuple[float, float]]) -> np.ndarray:

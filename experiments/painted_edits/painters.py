@@ -15,6 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from envedit.core.color import luminance
+from envedit.representations.layers import placed_lights
 from envedit.representations.layers.separation import separate
 from envedit.scene.scene import Scene
 
@@ -26,8 +27,8 @@ LEAST_CONTRAST = 1.15
 """Radiance beside a shadow over that in it, below which it is not to be seen."""
 LEAST_COVERAGE = 1 / 255
 """Coverage below which a pixel is not painted: a step of a mask of 8 bits."""
-LEAST_ELEVATION, MOST_ELEVATION = 0.1, 1.5
-"""Elevations of a lowered sun, radians."""
+ELEVATIONS = np.degrees((0.1, 1.5))
+"""The least and the largest elevation of a lowered sun, degrees."""
 
 
 @dataclass(frozen=True)
@@ -130,15 +131,12 @@ class View:
         return np.where(covered < LEAST_COVERAGE, 0, covered)
 
 
-def turned(direction: np.ndarray, degrees: float, lift: float = 0.0) -> np.ndarray:
+def turned(toward: np.ndarray, degrees: float, lift: float = 0.0) -> np.ndarray:
     """Return a direction turned about the vertical, and lifted, by degrees."""
-    x, y, z = direction
-    azimuth = np.arctan2(x, z) + np.radians(degrees)
-    elevation = np.arcsin(y)
+    azimuth, elevation = placed_lights.angles(toward)
     if lift:
-        elevation = np.clip(elevation + np.radians(lift), LEAST_ELEVATION, MOST_ELEVATION)
-    level = np.cos(elevation)
-    return np.array([level * np.sin(azimuth), np.sin(elevation), level * np.cos(azimuth)])
+        elevation = float(np.clip(elevation + lift, *ELEVATIONS))
+    return placed_lights.direction(azimuth - degrees, elevation)
 
 
 # ---- Shadows -----------------------------------------------------------------------------------------------

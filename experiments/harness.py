@@ -132,7 +132,9 @@ class Done:
     @cached_property
     def maps(self) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
         """Original, edited and true map; None for a target without one, or where its file is gone."""
-        original, edited = layer(self.folder, "initial"), self.picture("edited")
+        layers = OpenEXR.File(str(self.folder / "edited_layers.exr"), separate_channels=True).channels()
+        original = np.stack([layers[f"initial.{c}"].pixels for c in "RGB"], axis=2)
+        edited = self.picture("edited")
         settings = config.load(self.folder / "config.toml")
         asked = settings.target
         if asked.kind != "envmap":
@@ -150,14 +152,6 @@ class Done:
         """Rows of the map that were edited."""
         first, last = self.metrics["active_rows"]
         return slice(first, last + 1)
-
-
-def layer(folder: Path, name: str) -> np.ndarray:
-    """Read a layer of ``edited_layers.exr``: (H, W, 3), or (H, W) of one that has luminance only."""
-    channels = OpenEXR.File(str(folder / "edited_layers.exr"), separate_channels=True).channels()
-    if f"{name}.Y" in channels:
-        return channels[f"{name}.Y"].pixels
-    return np.stack([channels[f"{name}.{c}"].pixels for c in "RGB"], axis=2).astype(np.float32)
 
 
 def edit_panels(done: Done) -> list[np.ndarray]:

@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from envedit import config, inputs
+from envedit.core import latlong
 from envedit.core.resampling import fit
 from envedit.images import images
 from experiments.plain_mitsuba import loaded, relit
@@ -41,7 +42,4 @@ def edited_by_adam(settings: config.Config, envmap: np.ndarray, photo: Path) -> 
         dr.backward(dr.mean(dr.square(rendering - target), axis=None))
         optimiser.step()
     seconds = time.perf_counter() - began
-    width = envmap.shape[1]
-    first = (params[name].shape[1] - width) // 2
-    found = np.exp(optimiser["log"].numpy())[:, first : first + width]
-    return np.ascontiguousarray(found, np.float32), seconds
+    return latlong.from_envmap_data(np.exp(optimiser["log"].numpy())), seconds

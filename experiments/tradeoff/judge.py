@@ -18,6 +18,7 @@ from envedit.core.color import luminance, tonemap
 from envedit.images import images
 from envedit.losses import metrics
 from envedit.scene import scene
+from experiments.measures import peak_error
 
 WIDTH, FILM = 512, 128
 """Texels and pixels across, of every map and rendering that is judged."""
@@ -66,17 +67,13 @@ class Judge:
         """
         halves = self._halves(edited, self.spp, SEED)
         rows = self._rows
-        place = latlong.directions(*self.true.shape[:2])
-        peaks = [place[metrics.peak_position(m[rows])] for m in (edited, self.true)]
         sunny = luminance(self.true[rows]).max() > SUNNY
-        # From the chord: an angle near 0 has no digits left in its cosine.
-        angle = 2 * np.degrees(np.arcsin(min(np.linalg.norm(peaks[0] - peaks[1]) / 2, 1.0)))
         render = metrics.compare(halves.mean(axis=0), self.target.mean(axis=0))
         render["psnr_without_noise"] = without_noise(halves, self.target)
         return {
             "render": render,
             "map": metrics.compare(edited[rows], self.true[rows]),
-            "sun_degrees": float(angle) if sunny else None,
+            "sun_degrees": peak_error(edited, self.true) if sunny else None,
         }
 
     def bounds(self) -> dict:

@@ -151,7 +151,7 @@ def test_the_true_map_is_as_good_as_noise_allows_and_the_unedited_one_is_not(sun
     assert judge.target.shape == (2, 12, 12, 3) and (judge.target[0] != judge.target[1]).any()
     bounds = judge.bounds()
     best, before = bounds["true"], bounds["unedited"]
-    assert best["map"]["psnr"] == metrics.PSNR_CAP and best["sun_degrees"] == 0
+    assert best["map"]["psnr"] == metrics.PSNR_CAP and best["sun_degrees"] < 1e-5
     assert best["render"]["psnr"] > before["render"]["psnr"] + 10
     assert best["render"]["psnr_without_noise"] > best["render"]["psnr"]
     # 60 degrees of azimuth, on the circle of the sun's row.

@@ -11,11 +11,11 @@ import mitsuba as mi
 import numpy as np
 
 from envedit import inputs
-from envedit.core import latlong
 from envedit.core.color import tonemap
 from envedit.images import images
 from envedit.images.analytic_sky import sunsky
 from envedit.losses import metrics
+from envedit.scene.path_tracer import PathTracer
 from envedit.transport.light_transport import LightTransport
 from experiments.harness import Experiment, calling, done_of, figure
 
@@ -89,18 +89,7 @@ def sky() -> np.ndarray:
 
 def path_tracing(scene, spp):
     """Return (map (H, W, 3), step) -> picture: Mitsuba's ``prb``, other seeds for its gradients."""
-    integrator = mi.load_dict({"type": "prb", "max_depth": DEPTH, "rr_depth": DEPTH + 1})
-
-    def render(envmap, step):
-        height, width, _ = envmap.shape
-        index = mi.UInt32(latlong.halo_index(height, width))  # Mitsuba repeats a column on either side
-        data = mi.TensorXf(dr.gather(mi.Float, envmap.array, index), (height, width + 2, 3))
-        scene.params[scene.envmap_key] = data
-        scene.params.update()
-        seeds = {"seed": 2 * step, "seed_grad": 2 * step + 1}
-        return mi.render(scene.mi, scene.params, integrator=integrator, spp=spp, **seeds)
-
-    return render
+    return PathTracer(scene, spp, DEPTH, one_thread=False).render
 
 
 def squared_error(picture, target):

@@ -6,8 +6,12 @@ import os
 import re
 from pathlib import Path
 
+import numpy as np
+
 from envedit.config.validators import meant
+from envedit.core.atomic_files import make_folder
 from envedit.core.errors import ConfigError, InputError
+from envedit.images import images
 from experiments.harness import Case, calling
 
 _NAME = re.compile(r"(?P<name>.+)_puresky_(?P<size>[1-9][0-9]?)k\.(?P<kind>hdr|exr)")
@@ -68,6 +72,13 @@ def file(name: str) -> str:
         hint = meant(name, found, f"there are {', '.join(found)}")
         raise ConfigError(f"no map {name}; {hint}")
     return str(found[name])
+
+
+def written(out: Path, name: str, envmap: np.ndarray) -> str:
+    """Write a map (H, W, 3) that an experiment makes to ``maps/NAME.exr``; returns the file."""
+    file = make_folder(out.absolute() / "maps") / f"{name.replace(' ', '_')}.exr"
+    images.write_exr(file, envmap)
+    return str(file)
 
 
 def cases(function, tables: dict | None = None, **arguments) -> list[Case]:

@@ -10,8 +10,6 @@ import math
 import numpy as np
 
 from envedit.core import latlong
-from envedit.core.atomic_files import make_folder
-from envedit.images import images
 from envedit.representations.layers.placed_lights import direction
 from experiments import puresky
 from experiments.harness import Case, Done, Experiment, edit_panels
@@ -59,16 +57,12 @@ def room(lamps: dict[str, tuple[float, float]]) -> np.ndarray:
 
 def cases(args):
     maps = puresky.others()
-    folder = make_folder(args.out / "maps").absolute()
-    rooms = {name: folder / f"{name.replace(' ', '_')}.exr" for name in ROOMS}
-    for name, file in rooms.items():
-        if not file.exists():
-            images.write_exr(file, room(ROOMS[name]))
+    rooms = {name: puresky.written(args.out, name, room(lamps)) for name, lamps in ROOMS.items()}
     made = []
     for name, file in (maps | {"room": rooms["as it is"]}).items():
         targets = {"60": {"rotate_degrees": 60}, "painted": {"kind": "strokes", "strokes": PAINT}}
         if name == "room":
-            targets |= {other: {"file": str(rooms[other])} for other in list(ROOMS)[1:]}
+            targets |= {other: {"file": rooms[other]} for other in list(ROOMS)[1:]}
         for label, target in targets.items():
             tables = {
                 "input": {"envmap": str(file), "width": WIDTH},

@@ -7,10 +7,8 @@ maps. With a turn of the sky allowed and without.
 
 import hashlib
 import itertools
-from pathlib import Path
 
-from envedit.core.atomic_files import make_folder
-from envedit.images import analytic_sky, images
+from envedit.images import analytic_sky
 from experiments import puresky
 from experiments.harness import Case, Done, Experiment
 from experiments.measures import SAME, psnr
@@ -35,11 +33,12 @@ def cases(args):
     names = sorted(skies)
     data = puresky.data()
     ground = {name: str(file) for name, file in puresky.others().items()}
-    analytic = {e: str(args.out.absolute() / "maps" / f"sunsky_{e}.exr") for e in (ELEVATION, *ELEVATIONS)}
-    make_folder(args.out / "maps")
-    for elevation, file in analytic.items():
-        if not Path(file).exists():
-            images.write_exr(file, analytic_sky.sunsky(WIDTH, 90.0, elevation))
+    analytic = {
+        elevation: puresky.written(
+            args.out, f"sunsky_{elevation}", analytic_sky.sunsky(WIDTH, 90.0, elevation)
+        )
+        for elevation in (ELEVATION, *ELEVATIONS)
+    }
     maps = skies | ground | {"sunsky": analytic[ELEVATION]}
     made = []
     for scene, (i, (name, source)), turn in itertools.product(

@@ -13,7 +13,6 @@ from pathlib import Path
 
 from envedit.config import presets
 from envedit.core import latlong
-from envedit.core.atomic_files import make_folder
 from envedit.images import images
 from envedit.sweep import DONE
 from experiments import puresky
@@ -94,18 +93,10 @@ def asked(args, kind: Kind, roughness: float | None) -> dict:
     scene = {"file": kind.scene} | ({} if roughness is None else {"parameters": {"roughness": roughness}})
     target = {"rotate_degrees": DEGREES}
     if args.name == "figure8":
-        target = {"file": str(turned(Path(puresky.file(OTHER)), args.out / "maps"))}
+        # All PureSky maps have their sun in the middle: another one, unturned, has its light there too.
+        turned = latlong.rotate(images.load_envmap(puresky.file(OTHER))[0], DEGREES)
+        target = {"file": puresky.written(args.out, f"{OTHER}-turned", turned)}
     return common | {"scene": scene, "target": target}
-
-
-def turned(file: Path, folder: Path) -> Path:
-    """Write a map turned by :data:`DEGREES` to ``NAME-turned.exr``.
-
-    All PureSky maps have their sun in the middle: another map alone is not another orientation of the light.
-    """
-    path = make_folder(folder.absolute()) / f"{file.stem}-turned.exr"
-    images.write_exr(path, latlong.rotate(images.load_envmap(str(file))[0], DEGREES))
-    return path
 
 
 # ---- Tables ------------------------------------------------------------------------------------------------

@@ -30,20 +30,15 @@ SUNNY = 1000.0
 
 
 class Judge:
-    """Judge maps that were to be turned as ``settings`` say, in their scene.
+    """Judge maps that were to be turned as ``settings`` say, in their scene."""
 
-    Renderings that are judged have ``spp`` samples a pixel, the reference ``true_spp``; maps are ``width``
-    texels across, pictures ``film`` pixels.
-    """
-
-    def __init__(self, settings: config.Config, spp=SPP, true_spp=TRUE_SPP, width=WIDTH, film=FILM):
-        self.spp, self.width = spp, width
-        self._scene = scene.load(settings.scene.file, film, film, settings.scene.parameters)
-        self._rows = inputs.active_rows("upper", width // 2).slice
+    def __init__(self, settings: config.Config):
+        self._scene = scene.load(settings.scene.file, FILM, FILM, settings.scene.parameters)
+        self._rows = inputs.active_rows("upper", WIDTH // 2).slice
         source = images.load_envmap(settings.input.envmap)[0]
         self.original = self._sized(source)  # (H, W, 3), before the edit
         self.true = self._sized(latlong.rotate(source, settings.target.degrees))
-        self.target = self._halves(self.true, true_spp, TRUE_SEED)  # (2, h, w, 3)
+        self.target = self._halves(self.true, TRUE_SPP, TRUE_SEED)  # (2, h, w, 3)
 
     def __call__(self, folder: Path) -> dict:
         """Judge what a run left, at the resolution of its file where it has that.
@@ -65,7 +60,7 @@ class Judge:
             ``psnr_without_noise``, see :func:`without_noise`; ``map``: psnr, ssim, mse of the upper half;
             ``sun_degrees``: angle between the brightest texels, None where the true map has no sun.
         """
-        halves = self._halves(edited, self.spp, SEED)
+        halves = self._halves(edited, SPP, SEED)
         rows = self._rows
         sunny = luminance(self.true[rows]).max() > SUNNY
         render = metrics.compare(halves.mean(axis=0), self.target.mean(axis=0))
@@ -81,7 +76,7 @@ class Judge:
         return {"unedited": self.compare(self.original), "true": self.compare(self.true)}
 
     def _sized(self, envmap):
-        return latlong.resize(envmap, self.width // 2, self.width)
+        return latlong.resize(envmap, WIDTH // 2, WIDTH)
 
     def _halves(self, envmap, spp, seed):
         """Render twice with half of the samples each, (2, h, w, 3) float64."""

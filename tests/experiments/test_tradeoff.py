@@ -130,8 +130,10 @@ def test_a_run_that_compiled_is_made_again(tmp_path, monkeypatch, compiling, lon
 
 
 # ---- how good a map is -------------------------------------------------------------------------------------
-def tiny(settings, **more):
-    return Judge(settings, **({"spp": 32, "true_spp": 128, "width": 64, "film": 12} | more))
+@pytest.fixture
+def tiny(monkeypatch):
+    for name, value in {"SPP": 32, "TRUE_SPP": 128, "WIDTH": 96, "FILM": 12}.items():
+        monkeypatch.setattr(f"experiments.tradeoff.judge.{name}", value)
 
 
 @pytest.fixture
@@ -144,8 +146,8 @@ def sunny(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_true_map_is_as_good_as_noise_allows_and_the_unedited_one_is_not(sunny):
-    judge = tiny(sunny, width=96)
+def test_the_true_map_is_as_good_as_noise_allows_and_the_unedited_one_is_not(sunny, tiny):
+    judge = Judge(sunny)
     source = images.read(sunny.input.envmap)[0]
     np.testing.assert_array_equal(judge.true, latlong.resize(np.roll(source, -16, 1), 48, 96))
     assert judge.target.shape == (2, 12, 12, 3) and (judge.target[0] != judge.target[1]).any()
@@ -161,8 +163,9 @@ def test_the_true_map_is_as_good_as_noise_allows_and_the_unedited_one_is_not(sun
 
 
 @pytest.mark.slow
-def test_runs_are_judged_by_the_map_at_full_resolution(sunny, tmp_path):
-    judge = tiny(sunny)
+def test_runs_are_judged_by_the_map_at_full_resolution(sunny, tiny, tmp_path, monkeypatch):
+    monkeypatch.setattr("experiments.tradeoff.judge.WIDTH", 64)
+    judge = Judge(sunny)
     true = latlong.rotate(images.read(sunny.input.envmap)[0], 60)
     (tmp_path / "metrics.json").write_text(json.dumps({"timing": {"fit_s": 0}}))
     # Without it, by the working map, whatever its width.

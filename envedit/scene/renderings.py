@@ -36,8 +36,7 @@ def rendered(
     # ---- From disk, or rendered and stored
     stored = cache.load(key)
     if stored is not None:
-        noise = np.array(stored["noise"]) if "noise" in stored else None
-        return np.array(stored["picture"]), int(stored["spp"]), noise
+        return stored["picture"], int(stored["spp"]), stored.get("noise")
     picture, taken, noise = scene.sampled(envmap, spp, seed, exactly)
     arrays = {"picture": picture, "spp": np.array(taken, np.int64)}
     cache.store(key, arrays if noise is None else arrays | {"noise": noise})

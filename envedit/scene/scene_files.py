@@ -38,7 +38,7 @@ MEMORY, MEMORY_PER_BYTE = 2**30, 20
 IMAGE_MEMORY = 2**34
 """For an image, whose size is bounded by what its header may declare."""
 _WAIT = 4  # times the processor time, on the clock
-_REMEMBERED_BYTES = 2**20  # of entries in the folder of caches: some 5,000 files
+_REMEMBERED_BYTES = 2**20  # of entries in the folder of caches: some 2,000 files
 CODE = """
 import importlib, json, sys
 sys.path[:], module, arguments = json.load(sys.stdin)

@@ -332,7 +332,7 @@ class LightTransport:
             if stored is None:
                 stored = {"matrix": overview.summed(self.forward)}
                 cache.store(key, stored)
-            overview.matrix = np.array(stored["matrix"])  # a copy: it may be a mapped file
+            overview.matrix = stored["matrix"]
             self._overview = overview
         return self._overview
 

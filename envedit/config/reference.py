@@ -91,8 +91,7 @@ def _lights() -> str:
 
 
 def _regions() -> str:
-    keys = region_schema.KEYS
-    rows = [[f"`{key}`", _values(keys[key]), about] for key, about in region_schema.MEANINGS.items()]
+    rows = [[f"`{key}`", _values(check), meaning] for key, (check, meaning) in region_schema.KEYS.items()]
     about = "A region has one shape: points or polygon; see [regions of the map](regions.md)."
     return f"### [[input.regions]]\n\n{about}\n\n{_table(['key', 'values', 'meaning'], rows)}"
 

@@ -5,72 +5,40 @@ What they do is :mod:`envedit.images.map_regions`'s.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
-from envedit.config.validators import (
-    Check,
-    Choice,
-    Number,
-    Numbers,
-    Schema,
-    Tables,
-    WantedError,
-    show,
-)
+from envedit.config.validators import Check, Choice, Number, Numbers, Points, Schema, Tables, show
 from envedit.core.errors import ConfigError
 
 MOST_REGIONS, MOST_POINTS = 64, 500
 """Regions of a map, and points of each."""
 ACTIONS = ("keep", "scale", "fill")
 _POINT = Numbers(Number(-360, 720), Number(-90, 90))
-_FACTOR = Number(0, 1e6)
+_DIRECTIONS = "azimuth, elevation"
 
-
-@dataclass(frozen=True)
-class Places(Check):
-    """Directions of the map, [azimuth, elevation] in degrees, of which there are at least so many."""
-
-    least: int
-    kind = "list"
-
-    def __call__(self, value: Any) -> list[list[float]]:
-        if not isinstance(value, list | tuple) or not self.least <= len(value) <= MOST_POINTS:
-            raise WantedError(str(self))
-        try:
-            return [_POINT(place) for place in value]
-        except WantedError:
-            raise WantedError(f"{self}; azimuth from -360 to 720, elevation from -90 to 90 degrees") from None
-
-    @property
-    def range(self) -> str:
-        return f"[[azimuth, elevation], ...], {self.least} to {MOST_POINTS}"
-
-    def schema(self) -> Schema:
-        items = _POINT.schema()
-        return {"type": "array", "items": items, "minItems": self.least, "maxItems": MOST_POINTS}
-
-
-KEYS: dict[str, Check] = {
-    "action": Choice(*ACTIONS),
-    "points": Places(1),
-    "radius": Number(0, 180, positive=True),
-    "polygon": Places(3),
-    "softness": Number(0, 180),
-    "factor": Numbers(*3 * [_FACTOR]),
+KEYS: dict[str, tuple[Check, str]] = {
+    "action": (
+        Choice(*ACTIONS),
+        "keep: an edit changes nothing there; scale: radiance is multiplied; fill: replaced by what is "
+        "around it",
+    ),
+    "points": (
+        Points(_POINT, _DIRECTIONS, 1, MOST_POINTS),
+        "middle line of a brush, directions of the map in degrees",
+    ),
+    "radius": (Number(0, 180, positive=True), "of the brush, degrees; only with points, and needed there"),
+    "polygon": (
+        Points(_POINT, _DIRECTIONS, 3, MOST_POINTS),
+        "corners of a region, joined by straight lines in the lat-long image; across its edge azimuths go on "
+        "below 0 or above 360",
+    ),
+    "softness": (
+        Number(0, 180),
+        "degrees outside the border over which the change fades, at least a texel",
+    ),
+    "factor": (Numbers(*3 * [Number(0, 1e6)]), "scale: factors on red, green and blue; needed"),
 }
-"""Of a region: what happens there, and where it is."""
-MEANINGS = {
-    "action": "keep: an edit changes nothing there; scale: radiance is multiplied; fill: replaced by what is "
-    "around it",
-    "points": "middle line of a brush, directions of the map in degrees",
-    "radius": "of the brush, degrees; only with points, and needed there",
-    "polygon": "corners of a region, joined by straight lines in the lat-long image; across its edge "
-    "azimuths go on below 0 or above 360",
-    "softness": "degrees outside the border over which the change fades, at least a texel",
-    "factor": "scale: factors on red, green and blue; needed",
-}
-"""What each key is, for the reference."""
+"""Of a region, what happens there and where it is: check and meaning of each key."""
 
 
 class RegionList(Tables):
@@ -80,7 +48,7 @@ class RegionList(Tables):
     most = MOST_REGIONS
 
     def _entry(self, name: str, region: dict[str, Any]) -> dict[str, Any]:
-        found = self._checked(name, region, KEYS)
+        found = self._checked(name, region, {key: check for key, (check, _) in KEYS.items()})
         if "action" not in found:
             raise ConfigError(f"{name}.action: got none, expected one of {', '.join(ACTIONS)}")
         if ("points" in found) == ("polygon" in found):
@@ -91,7 +59,7 @@ class RegionList(Tables):
         return {"softness": 0.0} | found
 
     def schema(self) -> Schema:
-        keys = {key: {**check.schema(), "description": MEANINGS[key]} for key, check in KEYS.items()}
+        keys = {key: {**check.schema(), "description": meaning} for key, (check, meaning) in KEYS.items()}
         shape = [{"required": ["points"]}, {"required": ["polygon"]}]
         brush = {"points": ["radius"], "radius": ["points"]}
         region = {"properties": keys, "required": ["action"], "oneOf": shape, "dependencies": brush}

@@ -16,6 +16,7 @@ from envedit.config.validators import (
     Choice,
     Number,
     Numbers,
+    Points,
     Schema,
     Tables,
     View,
@@ -90,29 +91,9 @@ class Rectangle(Check):
         return _CORNERS.schema()
 
 
-@dataclass(frozen=True)
-class Points(Check):
-    """Points, of which there are at least so many."""
-
-    least: int
-    kind = "list"
-
-    def __call__(self, value: Any) -> list[list[float]]:
-        if not isinstance(value, list | tuple) or len(value) < self.least:
-            raise WantedError(str(self))
-        return [_POINT(v) for v in value]
-
-    @property
-    def range(self) -> str:
-        return f"[[x, y], ...], at least {self.least}"
-
-    def schema(self) -> Schema:
-        return {"type": "array", "items": _POINT.schema(), "minItems": self.least}
-
-
 SHAPES: dict[str, Check] = {
-    "points": Points(1),
-    "polygon": Points(3),
+    "points": Points(_POINT, "x, y", 1),
+    "polygon": Points(_POINT, "x, y", 3),
     "ellipse": Ellipse(),
     "rectangle": Rectangle(),
 }

@@ -270,6 +270,32 @@ class Numbers(Check):
         return {"type": "array", "items": items, "minItems": len(items), "maxItems": len(items)}
 
 
+@dataclass(frozen=True)
+class Points(Check):
+    """A list of points, each a list of two numbers; ``most`` of None: any number of them."""
+
+    point: Numbers
+    names: str  # of the two numbers
+    least: int
+    most: int | None = None
+    kind = "list"
+
+    def __call__(self, value: Any) -> list[list[float]]:
+        most = math.inf if self.most is None else self.most
+        if not isinstance(value, list | tuple) or not self.least <= len(value) <= most:
+            raise WantedError(str(self))
+        return [self.point(v) for v in value]
+
+    @property
+    def range(self) -> str:
+        count = f"at least {self.least}" if self.most is None else f"{self.least} to {self.most}"
+        return f"[[{self.names}], ...], {count}"
+
+    def schema(self) -> Schema:
+        points: Schema = {"type": "array", "items": self.point.schema(), "minItems": self.least}
+        return points if self.most is None else points | {"maxItems": self.most}
+
+
 class Pair(Numbers):
     """Two values of one check, as a tuple."""
 

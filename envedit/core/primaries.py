@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Iterable
 
 import numpy as np
@@ -40,6 +39,7 @@ NAMES = {
 _SAYING_NOTHING = {"unknown", "raw", "data", "none", "unspecified", "default", "non-color", "utility - raw"}
 SAME = 2e-3
 """Chromaticities that differ by no more are the same: programs write few digits."""
+_FLAT = 2e-6  # twice the area of a triangle of primaries that counts as a line
 _BRADFORD = np.array(  # Lam 1985, as of ICC.1:2010, Annex E
     [[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]]
 )
@@ -55,12 +55,11 @@ def known(chromaticities: Iterable[float], where: str) -> Chromaticities | None:
         if np.allclose(values, REC709, atol=SAME):
             return None
         columns = _xyz(values)
-        share = np.zeros(3)
-        if _area(values) > 1e-6:
-            with np.errstate(all="ignore"), contextlib.suppress(np.linalg.LinAlgError):
+        with np.errstate(all="ignore"):
+            if abs(np.linalg.det(columns[:, :3])) > _FLAT:
                 share = np.linalg.solve(columns[:, :3], columns[:, 3])
-        if np.isfinite(share).all() and (share > 0).all():
-            return values
+                if np.isfinite(share).all() and (share > 0).all():
+                    return values
     shown = ", ".join(f"{v:.4g}" for v in values[:8])
     raise InputError(f"{where}: its chromaticities ({shown}) are no primaries: save it as linear Rec. 709")
 
@@ -123,8 +122,3 @@ def _xyz(chromaticities):
     """Return x, y, z of red, green, blue and white as columns."""
     x, y = np.reshape(chromaticities, (4, 2)).T.astype(np.float64)
     return np.stack([x, y, 1 - x - y])
-
-
-def _area(chromaticities):
-    (ax, ay), (bx, by), (cx, cy) = np.reshape(chromaticities, (4, 2))[:3]
-    return abs((bx - ax) * (cy - ay) - (cx - ax) * (by - ay)) / 2

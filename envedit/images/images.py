@@ -262,10 +262,10 @@ def write_exr(
     cannot be written.
     """
     name = os.fsdecode(path)
-    pixels = _checked(name, image)
+    pixels = finite(name, image)
     if half:
         with np.errstate(over="ignore"):  # refused as an infinity
-            pixels = _checked(name, pixels.astype(np.float16)).astype(np.float16)
+            pixels = finite(name, pixels.astype(np.float16)).astype(np.float16)
     planes = {channel: pixels[..., i] for i, channel in enumerate("RGB")}
     if alpha is not None:
         planes["A"] = np.asarray(alpha, np.float32)
@@ -287,19 +287,14 @@ def write_layers(
     """
     name = os.fsdecode(path)
     default = DEFAULT if DEFAULT in layers else next(iter(layers))
-    planes = {}
-    size = np.shape(layers[default])[:2]
+    planes: dict[str, np.ndarray] = {}
     for layer, values in layers.items():
-        values = np.asarray(values)
-        colour = values.ndim == 3 and values.shape[2] == 3
-        if not (colour or values.ndim == 2 and layer != default) or values.shape[:2] != size or 0 in size:
-            raise ValueError(
-                f"{name}: layer '{layer}' has shape {values.shape}, expected {size} with 3 channels"
-            )
         values = finite(name, values, layer)
         prefix = "" if layer == default else f"{layer}."
-        for i, channel in enumerate("RGB" if colour else "Y"):
-            planes[prefix + channel] = values[..., i] if colour else values
+        if values.ndim == 2:
+            planes[f"{prefix}Y"] = values
+        else:
+            planes |= {prefix + channel: values[..., i] for i, channel in enumerate("RGB")}
     exr.write(name, planes, chromaticities)
 
 
@@ -311,7 +306,7 @@ def write_hdr(
     Few programs read ``chromaticities`` from such a file; None: Rec. 709. Errors as of :func:`write_exr`.
     """
     name = os.fsdecode(path)
-    write_atomically(name, rgbe.encode(_checked(name, image), chromaticities))
+    write_atomically(name, rgbe.encode(finite(name, image), chromaticities))
 
 
 def write_png(path: FilePath, image: ArrayLike, bits: int = 8, metadata: dict | None = None) -> None:
@@ -321,8 +316,8 @@ def write_png(path: FilePath, image: ArrayLike, bits: int = 8, metadata: dict | 
     ``metadata`` are texts to add, as ``tEXt`` chunks.
     """
     name = os.fsdecode(path)
-    image = np.asarray(image)
-    image = _checked(name, np.repeat(image[..., None], 3, 2) if image.ndim == 2 else image)
+    image = finite(name, image)
+    image = np.repeat(image[..., None], 3, 2) if image.ndim == 2 else image
     codes = np.rint(np.clip(image, 0, 1) * np.float32(2**bits - 1))
     write_atomically(name, png(codes.astype({8: np.uint8, 16: np.uint16}[bits]), metadata))
 
@@ -349,11 +344,3 @@ def _text_chunk(key, value):
     """Return a PNG chunk ``tEXt``, whose characters are Latin-1; others become question marks."""
     body = b"tEXt" + f"{key}\0{value}".encode("latin-1", "replace")
     return (len(body) - 4).to_bytes(4, "big") + body + zlib.crc32(body).to_bytes(4, "big")
-
-
-def _checked(name, image):
-    """Return the image as float32 (H, W, 3), refusing anything a file must not hold."""
-    image = np.asarray(image)
-    if image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
-        raise ValueError(f"{name}: an image to write is (H, W, 3), got shape {image.shape}")
-    return finite(name, image)

@@ -2,7 +2,6 @@
 
 import os
 import struct
-import subprocess
 import sys
 import threading
 import time
@@ -89,18 +88,15 @@ def test_exr_luminance_is_grey_and_no_colour_is_refused(tmp_path, rng):
         images.read(exr(tmp_path / "z.exr", Z=rng.random((4, 8)).astype(np.float32)))
 
 
-def test_exr_window_and_primaries(tmp_path, rng):
+def test_a_data_window_is_placed_in_the_display_window(tmp_path, rng):
     p = planes(rng)
     box = {"dataWindow": ((2, 1), (9, 4)), "displayWindow": ((0, 0), (7, 3))}
-    header = {"chromaticities": (0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.077, 0.32168, 0.33767)}  # ACES AP0
     path = exr(tmp_path / "w.exr", box, **p)
     found, info = images.read(path)
     expected = np.zeros((4, 8, 3), np.float32)
     expected[1:, 2:] = stacked(p)[:3, :6]
     np.testing.assert_array_equal(found, expected)
     assert "cropped" in info["warnings"][0]
-    _, info = images.read(exr(tmp_path / "aces.exr", header, **p))
-    assert "converted from ACES2065-1 to Rec. 709" in info["warnings"][0]
 
 
 def rgbe_file(path, body, size="-Y 4 +X 8", header="FORMAT=32-bit_rle_rgbe\n"):
@@ -135,19 +131,13 @@ def test_radiance_encodings(tmp_path, rng):
     np.testing.assert_array_equal(found, np.broadcast_to(expected[0, 1], (1, 511, 3)))
 
 
-def test_radiance_header(tmp_path, rng):
-    q = rng.integers(128, 256, (4, 8, 4)).astype(np.uint8).tobytes()
-    with pytest.raises(InputError, match=r"x.hdr: holds XYZ colours"):
-        images.read(rgbe_file(tmp_path / "x.hdr", q, header="FORMAT=32-bit_rle_xyze\n"))
-    with pytest.raises(InputError, match=r"x.hdr: rows are stored as '\+Y 4 \+X 8'"):
-        images.read(rgbe_file(tmp_path / "x.hdr", q, size="+Y 4 +X 8"))
-
-
 @pytest.mark.parametrize(("header", "told"), [
     ("EXPOSURE=2\nEXPOSURE=4.0\n", "EXPOSURE=8 in its header is not undone"),
     ("EXPOSURE=2\nEXPOSURE=0.5\n", None),
     ("EXPOSURE=2\nEXPOSURE=x\n", "EXPOSURE=2, x in its header"),
     ("COLORCORR=1 2 1\nCOLORCORR=1 2 0.5\n", "COLORCORR=1 4 0.5 in its header"),
+    ("EXPOSURE = 2.5EV \n", "EXPOSURE=2.5EV in its header"),  # odd, and no damage
+    ("EXPOSURE=1 1 1\n", None),
     ("GAMMA=2.2\n", "GAMMA=2.2 in its header is not undone"),
     ("GAMMA=1\nPRIMARIES=0 0 0 0 0 0 0 0\n", None),  # what some programs write into every file
     ("PRIMARIES=0.64 0.33 0.30 0.60 0.15 0.06 0.3127 0.3290\n", None),
@@ -256,6 +246,7 @@ def damaged_files(folder, rng):
     q = rng.integers(0, 256, (64, 128, 3)).astype(np.uint8)
     codes, jpg = (png(folder / f"whole.{kind}", q).read_bytes() for kind in ("png", "jpg"))
     sof = jpg.index(b"\xff\xc0") + 5
+    dqt = jpg.index(b"\xff\xdb") + 2
 
     def window(x, y):
         return raw[:at] + struct.pack("<4i", 0, 0, x, y) + raw[at + 16 :]
@@ -277,12 +268,15 @@ def damaged_files(folder, rng):
         "long.hdr": (hdr.replace(b"\x02\x02\x00\x08\x08", b"\x02\x02\x00\x08\xff"), "is too long"),
         "flat.hdr": (hdr[: hdr.index(b"+X 8") + 5] + bytes(range(3, 40)), "damaged or truncated"),
         "wide.hdr": (hdr.replace(b"-Y 4 +X 8", b"-Y 100000 +X 200000"), "declares 200000 x 100000 texels"),
+        "xyz.hdr": (hdr.replace(b"rle_rgbe", b"rle_xyze"), "holds XYZ colours"),
+        "turned.hdr": (hdr.replace(b"-Y 4 +X 8", b"+Y 4 +X 8"), "rows are stored as '+Y 4 +X 8'"),
         "none.hdr": (hdr.replace(b"-Y 4 +X 8", b"-Y 0 +X 0"), "declares 0 x 0 texels"),
         "half.png": (codes[: len(codes) // 2], "damaged or truncated"),
         "magic.png": (codes[:8], "png: "),
         "wide.png": (codes[:16] + struct.pack(">2I", *2 * [2**31 - 1]) + codes[24:], "declares 2147483647 x"),
         "half.jpg": (jpg[: len(jpg) // 2], "damaged or truncated"),
         "magic.jpg": (jpg[:3], "damaged or truncated"),
+        "table.jpg": (jpg[:dqt] + struct.pack(">H", 66) + jpg[dqt + 2 :], "damaged"),  # a value is missing
         "wide.jpg": (jpg[:sof] + b"\xff\xff\xff\xff" + jpg[sof + 4 :], "declares 65535 x 65535 texels"),
     }
     for name, (content, words) in files.items():
@@ -301,34 +295,6 @@ def test_damaged_files_are_refused_quietly(tmp_path, rng, capfd):
         assert message.startswith(str(tmp_path / name)) and words in message, message
         assert "\n" not in message
     assert capfd.readouterr() == ("", "")  # no library has spoken over us
-
-
-@pytest.mark.slow
-def test_reading_survives_random_damage(tmp_path, rng):
-    """Flip bytes: each file either reads or is refused, in a process that must end well."""
-    exr(tmp_path / "a.exr", **planes(rng, np.float16, (8, 16)))
-    rgbe_file(tmp_path / "a.hdr", run_length(rng.integers(128, 256, (4, 8, 4)).astype(np.uint8)))
-    script = """
-import sys, numpy as np
-from pathlib import Path
-from envedit.images import images
-from envedit.core.errors import InputError
-rng, folder, refused = np.random.default_rng(1), Path(sys.argv[1]), 0
-for name in ("a.exr", "a.hdr"):
-    raw = np.frombuffer((folder / name).read_bytes(), np.uint8)
-    for _ in range(200):
-        bad = raw.copy()
-        bad[rng.integers(4, len(raw), 3)] = rng.integers(0, 256, 3)
-        (folder / ("b" + name)).write_bytes(bad.tobytes())
-        try:
-            images.read(folder / ("b" + name))
-        except InputError:
-            refused += 1
-print(refused)
-"""
-    done = subprocess.run([sys.executable, "-c", script, tmp_path], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr[-2000:]
-    assert int(done.stdout) > 20
 
 
 def test_threads_that_read_leave_the_standard_streams_as_they_were(tmp_path, rng):
@@ -400,23 +366,3 @@ def test_a_long_line_in_a_radiance_header_takes_no_time(tmp_path, line):
     _, info = images.read(tmp_path / "l.hdr")
     assert time.process_time() - start < 2  # with a pattern: 10 to 25 s of processor time
     assert all(len(w) < 200 and w.isprintable() for w in info["warnings"])
-
-
-@pytest.mark.parametrize(
-    ("value", "told"), [("2.5EV", True), ("1-2", True), ("1 1 1", False), ("1.0", False)]
-)
-def test_odd_exposures_are_told_and_not_damage(tmp_path, value, told):
-    text = f"#?RADIANCE\nEXPOSURE = {value} \n\n-Y 4 +X 8\n"
-    (tmp_path / "e.hdr").write_bytes(text.encode() + bytes(range(128)))
-    _, info = images.read(tmp_path / "e.hdr")
-    assert info["metadata"] == {"EXPOSURE": value}
-    assert [f"EXPOSURE={value} in its header" in w for w in info["warnings"]] == [True] * told
-
-
-def test_a_jpeg_whose_table_breaks_off_is_damaged(tmp_path):
-    raw = png(tmp_path / "a.jpg", np.full((16, 32, 3), 188, np.uint8)).read_bytes()
-    at = raw.index(b"\xff\xdb")
-    for length in (3, 20, 66):  # the table's first byte only, some of it, all but one
-        (tmp_path / "b.jpg").write_bytes(raw[: at + 2] + struct.pack(">H", length) + raw[at + 4 :])
-        with pytest.raises(InputError, match="b.jpg: damaged"):
-            images.read_stored(tmp_path / "b.jpg")

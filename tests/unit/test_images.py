@@ -26,13 +26,6 @@ def test_a_panorama_is_twice_as_wide_as_high_to_a_texel(size, panorama, ending, 
     assert images.is_panorama(file) == panorama
 
 
-def test_what_cannot_be_read_is_no_panorama(tmp_path):
-    (tmp_path / "a.exr").write_bytes(b"no image")
-    for name in ("a.exr", "nowhere.png"):
-        with pytest.raises(InputError, match=name):
-            images.is_panorama(tmp_path / name)
-
-
 def test_load_envmap(tmp_path, rng):
     p = planes(rng, size=(8, 16))
     p["G"][3, 4] = -2
@@ -64,6 +57,19 @@ def test_load_envmap(tmp_path, rng):
     np.testing.assert_allclose(images.load_envmap(path, repair=True)[0][5, 2, 0], 65504)
 
 
+@pytest.mark.parametrize(("header", "size", "says"), [
+    ({}, (48, 64), "is 2:1, this is 64 x 48; crop it, or convert it to lat-long"),
+    (
+        {"dataWindow": ((0, 0), (15, 7)), "displayWindow": ((0, 0), (31, 17))},
+        (8, 16),
+        "this is 32 x 18, its display window, and its data window 16 x 8",
+    ),
+])  # fmt: skip
+def test_what_is_not_lat_long_is_refused(header, size, says, tmp_path, rng):
+    with pytest.raises(InputError, match=says):
+        images.load_envmap(exr(tmp_path / "a.exr", header, **planes(rng, size=size)))
+
+
 def test_load_envmap_refusals(tmp_path):
     def grey(height, width, value=1.0):
         return exr(tmp_path / "g.exr", **{c: np.full((height, width), value, np.float32) for c in "RGB"})
@@ -78,19 +84,6 @@ def test_load_envmap_refusals(tmp_path):
         images.load_envmap(grey(4, 8, np.nan), repair=True)
     found, info = images.load_envmap(grey(4, 8, 0.0), width=16)
     assert not found.any() and "black" in info["warnings"][0]
-
-
-def test_what_is_not_lat_long_is_refused(tmp_path):
-    path = exr(tmp_path / "a.exr", **{c: np.ones((48, 64), np.float32) for c in "RGB"})
-    with pytest.raises(InputError, match=r"a.exr: .* is 2:1, this is 64 x 48; crop it, or convert it to lat"):
-        images.load_envmap(path)
-
-
-def test_a_display_window_of_another_shape_is_named(tmp_path, rng):
-    header = {"dataWindow": ((0, 0), (15, 7)), "displayWindow": ((0, 0), (31, 17))}
-    path = exr(tmp_path / "a.exr", header, **planes(rng, size=(8, 16)))
-    with pytest.raises(InputError, match=r"this is 32 x 18, its display window, and its data window 16 x 8"):
-        images.load_envmap(path)
 
 
 @pytest.mark.parametrize(("height", "width"), [(103, 205), (103, 207), (33, 65)])
@@ -144,14 +137,4 @@ def test_unwritable(tmp_path):
         (tmp_path / "taken").mkdir(exist_ok=True)
         with pytest.raises(InputError, match=r"taken: cannot be written \(Is a directory\)"):
             writer(tmp_path / "taken", values)
-        with pytest.raises(ValueError, match=r"\(H, W, 3\), got shape \(4, 8, 4\)"):
-            writer(tmp_path / "a", np.zeros((4, 8, 4)))
     assert os.listdir(tmp_path) == ["taken"]
-
-
-def test_write_png(tmp_path):
-    ramp = np.linspace(-0.1, 1.1, 32).reshape(4, 8)
-    images.write_png(tmp_path / "a.png", ramp)
-    found = np.array(mi.Bitmap(str(tmp_path / "a.png")))
-    assert found.shape == (4, 8, 3) and found.dtype == np.uint8
-    np.testing.assert_array_equal(found[..., 1], np.rint(np.clip(ramp, 0, 1) * 255))

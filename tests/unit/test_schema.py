@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-import string
 import tomllib
 
 import pytest
@@ -240,12 +239,6 @@ def only_config_errors(call):
 @given(st.dictionaries(keys, st.dictionaries(keys, anything, max_size=3) | anything, max_size=4) | anything)
 def test_junk_tables_raise_nothing_but_config_errors(table):
     only_config_errors(lambda: cfg.from_dict(table))
-
-
-@quick
-@given(st.text(string.printable, max_size=60) | st.text(max_size=20))
-def test_junk_text_raises_nothing_but_config_errors(text):
-    only_config_errors(lambda: cfg.loads(text))
 
 
 @quick

@@ -4,7 +4,6 @@ import os
 import socket
 import subprocess
 import sys
-import threading
 
 import pytest
 
@@ -79,26 +78,6 @@ def test_a_file_that_was_removed_in_between_locks_nothing(tmp_path, monkeypatch)
 
     monkeypatch.setattr(file_locks, "lock", remove_first)
     assert busy(path) == "another process"
-
-
-def test_of_many_who_ask_at_once_one_gets_the_lock(tmp_path):
-    gate, held = threading.Barrier(4), []
-
-    def ask():
-        gate.wait()
-        try:
-            with file_locks.locked(tmp_path / "lock"):
-                held.append(True)
-                gate.wait()
-        except file_locks.Busy:
-            gate.wait()
-
-    threads = [threading.Thread(target=ask) for _ in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert held == [True]
 
 
 def test_a_file_system_without_locks_does_without(tmp_path, monkeypatch):

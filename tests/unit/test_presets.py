@@ -51,14 +51,16 @@ def test_default_then_preset_then_file_then_override_key_by_key():
 MANY = ("siren", "pixels", "log-pixels")
 
 
-@pytest.mark.parametrize(("preset", "kind", "ssim", "iterations"), [
-    ("standard", "layers", 0.1, 100),
-    ("draft", "layers", 0.1, 100),
-    *(("standard", kind, 1.0, "auto" if kind == "siren" else 600) for kind in MANY),
-    *(("draft", kind, 1.0, 150) for kind in MANY),
-    *(("paper", kind, (1.0, 1e4), 400) for kind in ("layers", *MANY)),
+@pytest.mark.parametrize(("preset", "kind", "ssim", "iterations", "dists"), [
+    ("standard", "layers", 0.1, 100, 0.0),
+    ("draft", "layers", 0.1, 100, 0.0),
+    ("standard", "siren", 1.0, "auto", "auto"),
+    ("draft", "siren", 1.0, 150, "auto"),
+    *(("standard", kind, 1.0, 600, 0.0) for kind in MANY[1:]),
+    *(("draft", kind, 1.0, 150, 0.0) for kind in MANY[1:]),
+    *(("paper", kind, (1.0, 1e4), 400, 0.6) for kind in ("layers", *MANY)),
 ])  # fmt: skip
-def test_loss_and_length_suit_the_kind(preset, kind, ssim, iterations):
+def test_losses_and_length_suit_the_kind(preset, kind, ssim, iterations, dists):
     given = [
         cfg.loads(f'preset = "{preset}"\n[representation]\nkind = "{kind}"'),
         cfg.loads("", preset=preset, overrides=[f"representation.kind={kind}"]),
@@ -67,11 +69,11 @@ def test_loss_and_length_suit_the_kind(preset, kind, ssim, iterations):
     for config in given:
         assert config.representation.kind == kind
         assert (config.loss.ssim, config.optimizer.iterations) == (ssim, iterations)
+        assert config.loss.dists == dists
 
 
 def test_the_last_kind_counts_and_file_and_override_beat_its_defaults_key_by_key():
     text = '[representation]\nkind = "siren"'
-    assert cfg.loads(text).optimizer.iterations == "auto"
     assert cfg.loads(text, overrides=["representation.kind=layers"]).optimizer.iterations == 100
     assert cfg.loads(text, overrides=["representation.kind=pixels"]).loss.ssim == 1.0
     assert cfg.loads("", preset="paper").representation.kind == "siren"
@@ -85,14 +87,6 @@ def test_the_last_kind_counts_and_file_and_override_beat_its_defaults_key_by_key
     # A given key that has the value of another kind's default is kept.
     same = cfg.loads("[loss]\nssim = 0.1", overrides=["representation.kind=siren"])
     assert same.loss.ssim == 0.1 and same.optimizer.iterations == "auto"
-
-
-def test_dists_is_left_to_the_weights_for_a_siren_alone():
-    for preset in ("draft", "standard"):
-        found = [cfg.loads("", preset, overrides=[f"representation.kind={kind}"]) for kind in MANY]
-        assert [one.loss.dists for one in found] == ["auto", 0.0, 0.0]
-    paper = cfg.loads("", preset="paper")
-    assert (paper.loss.dists, paper.optimizer.iterations) == (0.6, 400)
 
 
 def test_a_target_is_a_file_or_a_turn_and_the_last_one_given_counts():

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from envedit.config.validators import Check, Choice, Number, Numbers, Points, Schema, Tables, show
+from envedit.config.validators import Check, Choice, Number, Numbers, Points, Schema, Tables
 from envedit.core.errors import ConfigError
 
 MOST_REGIONS, MOST_POINTS = 64, 500
@@ -54,8 +54,10 @@ class RegionList(Tables):
         if ("points" in found) == ("polygon" in found):
             given = "both" if "points" in found else "neither"
             raise ConfigError(f"{name}: got {given} of points and polygon, expected one of them")
-        _require(name, "radius", found, needed="points" in found, where="with points")
-        _require(name, "factor", found, needed=found["action"] == "scale", where='where action is "scale"')
+        self._require(name, "radius", found, needed="points" in found, where="with points")
+        self._require(
+            name, "factor", found, needed=found["action"] == "scale", where='where action is "scale"'
+        )
         return {"softness": 0.0} | found
 
     def schema(self) -> Schema:
@@ -64,11 +66,3 @@ class RegionList(Tables):
         brush = {"points": ["radius"], "radius": ["points"]}
         region = {"properties": keys, "required": ["action"], "oneOf": shape, "dependencies": brush}
         return self._schema_of(region)
-
-
-def _require(name, key, found, needed, where):
-    """Raise ConfigError where a key is missing, or is given without a meaning."""
-    if needed and key not in found:
-        raise ConfigError(f"{name}.{key}: got none, expected one {where}")
-    if not needed and key in found:
-        raise ConfigError(f"{name}.{key}: got {show(found[key])}, expected none but {where}")

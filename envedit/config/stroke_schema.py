@@ -21,9 +21,7 @@ from envedit.config.validators import (
     Tables,
     View,
     WantedError,
-    meant,
     named,
-    show,
 )
 from envedit.core.color import srgb_to_linear
 from envedit.core.errors import ConfigError
@@ -148,18 +146,21 @@ class StrokeList(Tables):
         if "type" not in stroke:
             raise ConfigError(f"{name}.type: got none, expected one of {', '.join(STROKES)}")
         kind = named(f"{name}.type", Choice(*STROKES), stroke["type"])
-        keys = STROKES[kind] | ANY_STROKE
-        known = ["type", *SHAPES, "width", "view", *keys]
-        for unknown in (k for k in stroke if k not in known):
-            raise ConfigError(f"{name}, type {kind}, has no key {show(unknown)}; {meant(unknown, known)}")
+        own = STROKES[kind] | ANY_STROKE
+        checks = {key: check for key, (_, check) in own.items()}
+        checks = {"type": Choice(kind), **SHAPES, "width": _LENGTH, "view": View(), **checks}
+        defaults = {key: default for key, (default, _) in own.items() if default is not None}
+        found = self._checked(name, defaults | stroke, checks)
 
-        found: dict[str, Any] = {"type": kind, **_shape_of(name, kind, stroke)}
-        if "view" in stroke:
-            found["view"] = named(f"{name}.view", View(), stroke["view"])
-        for key, (default, check) in keys.items():
-            if key not in stroke and default is None:
-                raise ConfigError(f"{name}.{key}: got none, expected a number, as type is {kind}")
-            found[key] = named(f"{name}.{key}", check, stroke.get(key, default))
+        # ---- One shape, and what it and the type need
+        shapes = [shape for shape in SHAPES if shape in found]
+        if len(shapes) > 1:
+            raise ConfigError(f"{name}: got {' and '.join(shapes)}, expected one shape")
+        if not shapes and kind not in WHOLE_IMAGE:
+            raise ConfigError(f"{name}: got no shape, expected one of {', '.join(SHAPES)} for type {kind}")
+        self._require(name, "width", found, needed="points" in found, where="with points")
+        for key in own.keys() - found.keys():
+            raise ConfigError(f"{name}.{key}: got none, expected a number, as type is {kind}")
         return found
 
     def schema(self) -> Schema:
@@ -169,29 +170,6 @@ class StrokeList(Tables):
             properties[key] = each[0] if len(each) == 1 else {"anyOf": each}
             properties[key] = {**properties[key], "description": MEANINGS[key]}
         return self._schema_of({"properties": properties, "required": ["type"]})
-
-
-def _shape_of(name: str, kind: str, stroke: dict[str, Any]) -> dict[str, Any]:
-    """Return the shape of a stroke, and the width of its brush."""
-    found: dict[str, Any] = {}
-    shapes = [shape for shape in SHAPES if shape in stroke]
-    if len(shapes) > 1:
-        raise ConfigError(f"{name}: got {' and '.join(shapes)}, expected one shape")
-    if not shapes and kind not in WHOLE_IMAGE:
-        raise ConfigError(f"{name}: got no shape, expected one of {', '.join(SHAPES)} for type {kind}")
-    for shape in shapes:
-        check, place, value = SHAPES[shape], f"{name}.{shape}", stroke[shape]
-        if isinstance(check, Points) and isinstance(value, list | tuple):
-            for i, point in enumerate(value):
-                named(f"{place}[{i}]", _POINT, point)
-        found[shape] = named(place, check, value)
-
-    brush = "points" in stroke
-    if brush and "width" not in stroke:
-        raise ConfigError(f"{name}.width: got none, expected the width of the brush, as points are given")
-    if "width" in stroke and not brush:
-        raise ConfigError(f"{name}.width: got {show(stroke['width'])}, expected none without points")
-    return found | ({"width": named(f"{name}.width", _LENGTH, stroke["width"])} if brush else {})
 
 
 def stroke_keys() -> dict[str, list[Check]]:

@@ -93,6 +93,13 @@ class Tables(Check):
             raise ConfigError(f"{name}: has no key {show(unknown)}; {meant(unknown, keys)}")
         return {key: named(f"{name}.{key}", check, table[key]) for key, check in keys.items() if key in table}
 
+    def _require(self, name: str, key: str, found: dict[str, Any], needed: bool, where: str) -> None:
+        """Raise ConfigError where a key of an entry is missing, or is given without a meaning."""
+        if needed and key not in found:
+            raise ConfigError(f"{name}.{key}: got none, expected one {where}")
+        if not needed and key in found:
+            raise ConfigError(f"{name}.{key}: got {show(found[key])}, expected none but {where}")
+
     @property
     def range(self) -> str:
         return "" if self.most is None else f"at most {self.most}"
@@ -284,7 +291,13 @@ class Points(Check):
         most = math.inf if self.most is None else self.most
         if not isinstance(value, list | tuple) or not self.least <= len(value) <= most:
             raise WantedError(str(self))
-        return [self.point(v) for v in value]
+        points = []
+        for i, place in enumerate(value):
+            try:
+                points.append(self.point(place))
+            except WantedError as error:
+                raise WantedError(f"{error} at point {i}") from None
+        return points
 
     @property
     def range(self) -> str:

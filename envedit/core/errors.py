@@ -60,6 +60,15 @@ def counted(count: int, one: str, many: str) -> str:
     return f"{count} {one if count == 1 else many}"
 
 
+def texels_are(bad: np.ndarray, what: str, first_row: int = 0, unit: str = "texel") -> str:
+    """Say how many texels of a mask, as of :func:`place_of`, are what they should not be, and which is first.
+
+    For example "2 texels are negative, the first at row 3, column 7".
+    """
+    count = int(bad.reshape(*bad.shape[:2], -1).any(axis=2).sum())
+    return f"{counted(count, f'{unit} is', f'{unit}s are')} {what}, the first at {place_of(bad, first_row)}"
+
+
 @contextlib.contextmanager
 def unwrapped() -> Iterator[None]:
     """Raise errors that a user should see, and Ctrl-C, as they are; also a decorator.

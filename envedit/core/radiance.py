@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from envedit.core.errors import InputError, counted, place_of
+from envedit.core.errors import InputError, counted, texels_are
 from envedit.core.types import ArrayLike
 
 HALF_MAX = 65504.0
@@ -42,9 +42,7 @@ def require_radiance(image: ArrayLike, what: str, first_row: int = 0, brightest:
         (image > brightest, f"brighter than {brightest:.3g}", "scale the map down"),
     ):
         if bad.any():
-            texels_are = counted(any_channel(bad).sum(), "texel is", "texels are")
-            where = f"the first at {place_of(bad, first_row)}"
-            raise InputError(f"{what}: {texels_are} {how}, {where}: {cure}")
+            raise InputError(f"{what}: {texels_are(bad, how, first_row)}: {cure}")
 
 
 def repair(image: ArrayLike) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

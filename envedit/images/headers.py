@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from envedit.core.atomic_files import opened
-from envedit.core.errors import InputError, NumericalError, counted, place_of
+from envedit.core.errors import InputError, NumericalError, texels_are
 from envedit.core.types import ArrayLike
 
 MAX_SIDE = 32768
@@ -63,12 +63,7 @@ def finite(name: str, values: ArrayLike, layer: str = "") -> np.ndarray:
     """Return an image (H, W, C) or (H, W) as float32, to be written; NumericalError if it is not finite."""
     with np.errstate(over="ignore"):  # caught below, as an infinity
         values = np.asarray(values).astype(np.float32, copy=False)
-    bad = ~np.isfinite(values)
-    if bad.any():
-        texels = bad.reshape(*bad.shape[:2], -1).any(axis=2)
-        first = ", ".join(f"{value:g}" for value in np.atleast_1d(values[texels][0]))
-        where = f"the first at {place_of(bad)} ({first})"
-        of_layer = f" of layer '{layer}'" if layer else ""
-        texels_are = counted(texels.sum(), f"texel{of_layer} is", f"texels{of_layer} are")
-        raise NumericalError(f"{name}: not written: {texels_are} not finite, {where}")
+    if (bad := ~np.isfinite(values)).any():
+        place = f"{name}, layer '{layer}'" if layer else name
+        raise NumericalError(f"{place}: not written: {texels_are(bad, 'not finite')}")
     return values

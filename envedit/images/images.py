@@ -15,7 +15,7 @@ import numpy as np
 
 from envedit.core import latlong, primaries, radiance
 from envedit.core.atomic_files import write_atomically
-from envedit.core.errors import ConfigError, EnveditError, InputError, counted, place_of
+from envedit.core.errors import ConfigError, EnveditError, InputError, texels_are
 from envedit.core.types import ArrayLike, FilePath, Info
 from envedit.images import exr, ldr, marks, rgbe, tiff
 from envedit.images.headers import MAX_SIDE, damaged, finite, head_of, shown
@@ -182,26 +182,20 @@ def _repaired(image, info, repair):
     if not bad.any():
         return image
     if not repair:
-        where = f"{_texels_are(bad)} NaN or infinite, the first at {place_of(bad)}"
         raise InputError(
-            f"{name}: {where}; repair the map, or set input.repair = true (of commands on maps: --repair)"
+            f"{name}: {texels_are(bad, 'NaN or infinite')}; repair the map, or set input.repair = true "
+            "(of commands on maps: --repair)"
         )
     try:
         image, overflowed, replaced = radiance.repair(image)
     except InputError as e:
         raise InputError(f"{name}: {e}") from None
     if overflowed.any():
-        where = f"{_texels_are(overflowed)} infinite, the first at {place_of(overflowed)}"
-        info["warnings"].append(f"{where}: taken for the brightest light, {image[overflowed].max():g}")
+        brightest = f"taken for the brightest light, {image[overflowed].max():g}"
+        info["warnings"].append(f"{texels_are(overflowed, 'infinite')}: {brightest}")
     if replaced.any():
-        where = f"{_texels_are(replaced)} NaN or -Inf, the first at {place_of(replaced)}"
-        info["warnings"].append(f"{where}: replaced from their neighbours")
+        info["warnings"].append(f"{texels_are(replaced, 'NaN or -Inf')}: replaced from their neighbours")
     return image
-
-
-def _texels_are(mask):
-    """Return how many texels of a mask (H, W) are set, as the begin of a sentence."""
-    return counted(mask.sum(), "texel is", "texels are")
 
 
 def _note_oddities(stored, image, info):
@@ -211,15 +205,12 @@ def _note_oddities(stored, image, info):
     negative = radiance.any_channel(stored < 0) & ~radiance.any_channel(~finite)
     info["clipped"] = int(negative.sum())
     if negative.any():
-        least = stored[finite].min()
-        where = f"the first at {place_of(negative)}"
-        warnings.append(f"{_texels_are(negative)} negative (down to {least:.3g}), {where}: set to 0")
+        what = f"negative (down to {stored[finite].min():.3g})"
+        warnings.append(f"{texels_are(negative, what)}: set to 0")
     saturated = radiance.any_channel(stored == radiance.HALF_MAX)
     if saturated.any():
-        warnings.append(
-            f"{_texels_are(saturated)} at 65504, the largest half, the first at {place_of(saturated)}: "
-            "the light was cut when the file was saved"
-        )
+        what = texels_are(saturated, "at 65504, the largest half")
+        warnings.append(f"{what}: the light was cut when the file was saved")
     if unread := info.get("unread"):
         names = ", ".join(shown(channel, 30) for channel in unread[:6]) + (", ..." if len(unread) > 6 else "")
         warnings.append(f"channels of the map beside its colours are not read: {names}")

@@ -36,7 +36,7 @@ import numpy as np
 from envedit.config.validators import meant
 from envedit.core import installed_plugins, latlong, shipped
 from envedit.core.color import tonemap
-from envedit.core.errors import ConfigError, EnveditError, InputError, NumericalError, counted, place_of
+from envedit.core.errors import ConfigError, EnveditError, InputError, NumericalError, texels_are
 from envedit.core.quiet_libraries import quiet_libraries
 from envedit.core.radiance import require_unmasked
 from envedit.core.types import ArrayLike, FilePath
@@ -157,13 +157,8 @@ class Scene:
             raise InputError(f"environment map: got {what}, expected (H, W, 3) numbers")
         with np.errstate(over="ignore"):  # a float64 too large for float32 becomes inf, and is named below
             image = image.astype(np.float32)
-        if not (good := np.isfinite(image) & (image >= 0)).all():
-            row, column, channel = np.argwhere(~good)[0]
-            texels_are = counted(int((~good.all(axis=2)).sum()), "texel is", "texels are")
-            raise NumericalError(
-                f"environment map: {texels_are} not finite or negative, "
-                f"the first at row {row}, column {column}: {image[row, column, channel]} in {'RGB'[channel]}"
-            )
+        if (bad := ~(np.isfinite(image) & (image >= 0))).any():
+            raise NumericalError(f"environment map: {texels_are(bad, 'not finite or negative')}")
         if not image[1:-1].any():  # Mitsuba's density has a factor sin(theta): it would sample nothing
             image = image.copy()
             image[[1, -2]] = np.maximum(image[[1, -2]], _SAMPLED * image[[0, -1]])
@@ -247,10 +242,9 @@ class Scene:
         with np.errstate(over="ignore"):
             result = total.astype(np.float32)
         if (bad := ~np.isfinite(result).all(axis=2)).any():
-            pixels_are = counted(bad.sum(), "pixel is", "pixels are")
             raise NumericalError(
-                f"rendering of {self.path or 'the scene'}: {pixels_are} not finite, "
-                f"the first at {place_of(bad)}; look for broken materials or too much light"
+                f"rendering of {self.path or 'the scene'}: {texels_are(bad, 'not finite', unit='pixel')}; "
+                "look for broken materials or too much light"
             )
         return result
 

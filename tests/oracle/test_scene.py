@@ -112,7 +112,7 @@ def test_auto_takes_as_many_samples_as_noise_asks_for(loaded, rng):
 def test_a_bad_texel_is_named_and_not_rendered(loaded, value):
     image = np.ones((8, 16, 3))
     image[3, 5, 1] = value
-    with pytest.raises(NumericalError, match=r"1 texel .* row 3, column 5: \S+ in G"):
+    with pytest.raises(NumericalError, match=r"1 texel .* row 3, column 5"):
         loaded.render(image)
 
 

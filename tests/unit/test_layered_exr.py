@@ -76,7 +76,7 @@ def test_values_that_are_not_finite_are_refused(tmp_path, bad):
     before = path.read_bytes()
     broken = grey(0.0).astype(np.float64)
     broken[3, 5, 1] = bad
-    with pytest.raises(NumericalError, match="1 texel of layer 'difference'.*row 3, column 5"):
+    with pytest.raises(NumericalError, match="layer 'difference': not written: 1 texel is .*row 3, column 5"):
         images.write_layers(path, {"edited": grey(1.0), "difference": broken})
     with pytest.raises(NumericalError, match="layer 'influence'.*row 3, column 5"):
         images.write_layers(path, {"edited": grey(1.0), "influence": broken[..., 1]})

@@ -274,7 +274,9 @@ def notes(settings: config.Input, scene: Scene, input_map: InputMap) -> list[str
         first.append("map: the analytic sky, as the scene is made for any map")
     elif settings.envmap == AUTO:
         first.append(f"map: the scene's own, {source}")
-    of_scene = source == SCENE or (own.file is not None and _same_file(source, own.file))
+    of_scene = source == SCENE
+    if own.file is not None:
+        of_scene |= os.path.realpath(source) == os.path.realpath(own.file)  # by whatever names
     if own.scale != 1 and of_scene:
         first.append(f"the scene multiplies it by scale {own.scale:g}")
     elif own.scale != 1:
@@ -288,11 +290,6 @@ def notes(settings: config.Input, scene: Scene, input_map: InputMap) -> list[str
         space = primaries.name_of(input_map.chromaticities)
         last.append(f"map in {space}: edited in Rec. 709, written in {space}")
     return [*first, *scene.notes, *last]
-
-
-def _same_file(first, second):
-    """Say whether two paths are of one file, by whatever names."""
-    return os.path.realpath(first) == os.path.realpath(second)
 
 
 def share(scene: Scene, radiance: np.ndarray, seed: int) -> float:

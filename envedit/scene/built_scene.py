@@ -20,7 +20,7 @@ import mitsuba as mi
 import numpy as np
 
 from envedit import config
-from envedit.core import latlong
+from envedit.core import latlong, rotations
 from envedit.core.errors import ConfigError, InputError
 from envedit.scene import scene as scenes
 from envedit.scene.scene import Scene
@@ -39,6 +39,7 @@ _DIRECT = {"DirectIntegrator", "DirectProjectiveIntegrator"}
 _VOLUMES = {"VolumetricPathIntegrator", "VolpathMisIntegratorImpl", "PRBVolpathIntegrator"}
 UNKNOWN = "built "
 """How the digest of a built scene begins: it says nothing of what the scene consists of."""
+_ROUNDING = 1e-4  # of a rotation's columns
 _ANY_DEPTH = 2**32 - 1  # as Mitsuba prints a depth of -1
 
 
@@ -171,12 +172,11 @@ def _texels(scene: Any) -> str:
 
 def _rotation(transform: Any) -> np.ndarray:
     """Return the rotation (3, 3) of a transformation."""
-    rotation = np.array(transform.matrix, np.float64).reshape(4, 4)[:3, :3]
-    if not np.isfinite(rotation).all() or np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-4:
+    matrix = np.array(transform.matrix, np.float64).reshape(4, 4)[:3, :3]
+    rotation = rotations.rotation_in(matrix, _ROUNDING)
+    if rotation is None or np.abs(rotation - matrix).max() > _ROUNDING:
         raise InputError("scene: to_world of the environment map is no rotation; scale the scene instead")
-    if np.linalg.det(rotation) < 0:
-        raise InputError("scene: to_world of the environment map mirrors; expected a rotation")
-    return rotation
+    return matrix
 
 
 def _integrator(scene: Any) -> Integrator:

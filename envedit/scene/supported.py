@@ -198,7 +198,7 @@ def take_sensors(
     """Choose the sensors whose pictures are edited, in the order asked for; the scene has no others then.
 
     ``selection`` is "all", or indices and ids. Returns the indices of their nodes; their ids, or ``sensor N``
-    where one has none; and notes, which of several are used and which not. ConfigError if there is no such
+    where one has none; and a note, which of several are used. ConfigError if there is no such
     sensor or one is asked for twice, InputError if one is of a kind that makes no picture.
     """
     # ---- Choose
@@ -225,22 +225,15 @@ def take_sensors(
 
     # ---- Leave out the others, and say so
     _keep_only(state, nodes)
-    used = ", ".join(_name(state.nodes[i]) for i in nodes[:4]) + (", ..." if len(nodes) > 4 else "")
-    others = [_name(state.nodes[i]) for i in sensors if i not in nodes]
-    more = ", ".join(others[:3]) + (", ..." if len(others) > 3 else "")
-    if len(nodes) > 1:
-        count = f"{len(nodes)} of {len(sensors)}" if more else f"{len(nodes)}"
-        note = f"{count} sensors are views: {used}" + (f"; not {more}" if more else "")
-        return nodes, names, (note,)
-    which = "the first" if chosen == [0] else "one"
-    return nodes, names, (f"{len(sensors)} sensors: {which} is used ({used}), not {more}",)
+    used = ", ".join(_name(state.nodes[i]) for i in nodes)
+    return nodes, names, (f"{len(nodes)} of {len(sensors)} sensors used: {used}",)
 
 
 def require_one_sensor(state: mi.parser.ParserState, where: str) -> None:
     """Refuse a scene with several sensors of which none was chosen, with a ConfigError that names them."""
     names = [n.props.id() for n in state.nodes if n.type == mi.ObjectType.Sensor]
     if len(names) > 1:
-        known = ", ".join(names[:8]) + (", ..." if len(names) > 8 else "")
+        known = ", ".join(names)
         how = f'--camera {names[0]}, or [scene] sensors = ["{names[0]}"]'
         raise ConfigError(f"{where}: {len(names)} cameras ({known}): choose one, such as {how}")
 

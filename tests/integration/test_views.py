@@ -62,7 +62,7 @@ def test_renderings_stand_below_each_other_in_the_order_asked_for(two, rng):
         ("behind", slice(20, 50)),
     ]
     assert (both.width, both.height) == (40, 50) and both.notes == (
-        "2 sensors are views: perspective front, perspective behind",
+        "2 of 2 sensors used: perspective front, perspective behind",
     )
     first = scene.load(two)
     np.testing.assert_array_equal(both.render(image, 16, 5)[:20], first.render(image, 16, 5))
@@ -189,7 +189,7 @@ def test_two_views_determine_more_sky_than_each_alone(two, capsys, monkeypatch):
     (two.parent / "c.toml").write_text(config.to_toml(settings_of(two, **small)))
     monkeypatch.setattr(search, "_moves", lambda *_: [])
     assert runs.call(two.parent / "c.toml", "--out", out) == 0
-    assert "2 sensors are views" in capsys.readouterr().out
+    assert "2 of 2 sensors used" in capsys.readouterr().out
     metrics = runs.measured(out)
     assert [view["name"] for view in metrics["views"]] == list(NAMES)
     mse = [view["render"]["mse"] for view in metrics["views"]]

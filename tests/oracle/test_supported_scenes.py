@@ -1,8 +1,5 @@
 """Scenes as users have them, against plain Mitsuba: the file as it is, rendered by ``mi.load_file``."""
 
-import re
-import shutil
-
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -57,36 +54,6 @@ def test_under_another_map_the_picture_is_mitsuba_s_with_the_scene_s_scale(tmp_p
     close(transport.apply(mi.TensorXf(radiance)).numpy(), expected, 0.02)
     said = " ".join(inputs.notes(settings.input, lit, given_map))
     assert not warnings and "scale 800" in said and "not the scene's own" in said
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("scene", "own", "other"),
-    [("matpreview/matpreview.xml", "envmap.exr", True), ("principled/scene.xml", "envmap.hdr", False)],
-)
-def test_public_scenes_are_as_bright_as_in_mitsuba(scene, own, other, data, tmp_path):
-    """With their emitter's scale; the map at the file's width, in a picture 64 wide."""
-    folder = tmp_path / "scene"
-    shutil.copytree((data / "scenes" / scene).parent, folder)
-    path, envmap = folder / (data / "scenes" / scene).name, folder / own
-    text = path.read_text()
-    if other:
-        envmap = data / "puresky" / "kloppenheim_06_puresky_1k.hdr"
-        text = text.replace(own, str(envmap))
-    used = path.with_name("plain.xml")  # this Mitsuba takes no capitals in names of plugins
-    used.write_text(re.sub('type="[A-Z][a-z]+"', lambda found: found[0].lower(), text))
-    width = images.load_envmap(str(envmap))[0].shape[1]
-    chosen = {"envmap": str(envmap) if other else "scene", "width": width}
-    settings = config.from_dict({"input": chosen, "scene": {"file": str(path), "width": 64}}, tmp_path)
-    lit = inputs.load_scene(settings.scene)
-    radiance, _ = inputs.load_map(settings.input, lit)
-    whole = mi.load_file(str(used))
-    params = mi.traverse(whole)
-    size = next(filter(lambda key: key.endswith("film.size"), params.keys()))
-    params[size] = [lit.width, lit.height]
-    params.update()
-    expected = np.array(mi.render(whole, spp=256, seed=5))[..., :3]
-    assert lit.render(radiance, 256, 3).mean() / expected.mean() == pytest.approx(1, abs=0.01)
 
 
 # ---- kinds of scenes -----------------------------------------------------------------------------------

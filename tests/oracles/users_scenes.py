@@ -105,7 +105,7 @@ KINDS = (
     Kind("blended and masked materials", ALL),
     Kind("instances", ALL),
     Kind("two sensors", (PATH, SENSOR, SENSOR.replace('"40"', '"20"'), BALL, light()),
-         "2 sensors: the first is used"),
+         "1 of 2 sensors used"),
     Kind("hidden emitters", (HIDDEN, SEEN, BALL, LAMP, light()),
          "rendered as Mitsuba does; pixels that see no surface are transparent and do not count", True),
     Kind("direct light only", ('<integrator type="direct"/>', SENSOR, BALL, FLOOR, light())),

@@ -9,21 +9,6 @@ from envedit.config import presets
 from envedit.core.errors import ConfigError
 
 
-def test_the_paper_preset_is_section_6():
-    paper = cfg.loads("", preset="paper")
-    siren = cfg.Representation("siren", "auto", False, 256, 6, 30.0, coordinates="plane")
-    assert paper.representation == siren
-    fit = paper.fit
-    assert (fit.epochs, fit.lr, fit.schedule, fit.restart_period) == (1500, 5e-5, "warm-restarts", 100)
-    assert (fit.log_mse, fit.log_ssim, fit.hdr) == (0.85, 0.25, 1e-2)
-    assert (fit.awp_gamma, fit.awp_lr, fit.awp_every, fit.awp_until) == (0.01, 1e-4, 1, 1)
-    assert (fit.beta2, fit.stride, fit.headroom, fit.light) == (0.999, 1, 0, 0)
-    assert (paper.optimizer.lr, paper.optimizer.iterations) == (5e-6, 400)
-    assert (paper.loss.ssim, paper.loss.dists) == ((1, 1e4), 0.6)
-    assert paper.loss.luminance == paper.loss.l1 == (1e-4, 1e-8)
-    assert (paper.input.width, paper.input.rows, paper.renderer.kind) == (256, "upper", "path")
-
-
 def test_the_paper_preset_spells_out_every_number_of_the_method():
     """A default that is changed later must not change the paper's recipe."""
     free = {"fit": {"cache"}, "representation": {"cycles"}, "loss": set()}

@@ -29,7 +29,7 @@ def choose(file: str, cameras: Sequence[tuple[Any, np.ndarray]], path: str) -> l
     if path == "all" or (not path and len(cameras) == 1):
         return list(cameras)
     paths = [str(prim.GetPath()) for prim, _ in cameras]
-    known = ", ".join(paths[:8]) + (", ..." if len(paths) > 8 else "")
+    known = ", ".join(paths)
     if not path:
         raise ConfigError(f"{file}: {len(paths)} cameras ({known}): choose one, such as --camera {paths[0]}")
     if path not in paths:

@@ -1,18 +1,12 @@
-"""Scenes of the kinds that people have, what happens with each, and with every plugin of Mitsuba.
-
-``python -m tests.oracles.users_scenes > docs/scenes.md`` writes the page;
-``tests/oracle/test_supported_scenes.py`` checks every row of it.
-"""
+"""Scenes of the kinds that people have, and what happens with each: the rows of ``docs/scenes.md``."""
 
 from __future__ import annotations
 
 import re
-import sys
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
-import mitsuba as mi
 import numpy as np
 
 from envedit import config, inputs
@@ -94,16 +88,14 @@ UNSCALED = '<transform name="to_world"><rotate y="1" angle="70"/></transform>'
 
 CONSTANT = '<emitter type="constant"><rgb name="radiance" value="0.9, 0.3, 0.1"/></emitter>'
 NO_FILM = re.sub("<film.*</film>", "", SENSOR, flags=re.DOTALL)
-ALL = (PATH, SENSOR, *MATERIALS, INSTANCES, FLOOR, light(0.55, TURN))
 
 KINDS = (
     Kind("a map of its own with a scale", (PATH, SENSOR, BALL, light(3))),
     Kind("a lamp (area light) beside the map", (PATH, SENSOR, BALL, FLOOR, LAMP, light(0.5, TURN)),
          "rendered as Mitsuba does; the lamp's light is constant"),
-    Kind("as Blender exports: principled, image textures, two-sided, scale", ALL),
-    Kind("normal maps, bump maps", ALL),
-    Kind("blended and masked materials", ALL),
-    Kind("instances", ALL),
+    Kind("as Blender exports: principled, image textures, two-sided, scale; normal maps, bump maps; "
+         "blended and masked materials; instances",
+         (PATH, SENSOR, *MATERIALS, INSTANCES, FLOOR, light(0.55, TURN))),
     Kind("two sensors", (PATH, SENSOR, SENSOR.replace('"40"', '"20"'), BALL, light()),
          "1 of 2 sensors used"),
     Kind("hidden emitters", (HIDDEN, SEEN, BALL, LAMP, light()),
@@ -151,90 +143,6 @@ def loaded(path: Path, width=0):
     return lit, input_map.radiance, inputs.notes(settings.input, lit, input_map)
 
 
-# ---- plugins -----------------------------------------------------------------------------------------------
-
-AS_IS, REFUSED, INSIDE = "as Mitsuba renders it", "refused by name", "only inside a medium: see media"
-PLUGINS = {
-    "emitter": {
-        "envmap": "the map that is edited; file, `to_world` and `scale` are taken",
-        "constant": "rendered to the map that is edited, or gives way to another; zenith: the sensor's up",
-        **dict.fromkeys(("sunsky", "timed_sunsky"),
-                        "rendered to the map that is edited, or gives way to another"),
-        **dict.fromkeys(("area", "directional", "directionalarea", "point", "projector", "spot"),
-                        "as Mitsuba renders it; its light is constant"),
-    },
-    "sensor": {
-        **dict.fromkeys(("perspective", "thinlens", "orthographic"), AS_IS),
-        **dict.fromkeys(("batch", "distant", "irradiancemeter", "radiancemeter"), REFUSED),
-    },
-    "film": {
-        "hdrfilm": "size and pixel format are set, the crop with them, the filter is kept",
-        "specfilm": REFUSED,
-    },
-    "integrator": {
-        **dict.fromkeys(
-            ("path", "ptracer"), "paths of its `max_depth`; `rr_depth` and `hide_emitters` are taken"
-        ),
-        "direct": "paths of two segments; `hide_emitters` is taken",
-        **dict.fromkeys(("volpath", "volpathmis"), "as `path`; with a medium in the scene refused"),
-        **dict.fromkeys(("aov", "moment", "stokes"), "the integrator inside it counts"),
-        "depth": "not used, which is said: rendered by `path`",
-    },
-    "medium": dict.fromkeys(("homogeneous", "heterogeneous"),
-                            "refused with `volpath` and its like; left out, which is said, with others"),
-    "phase": dict.fromkeys(("blendphase", "hg", "isotropic", "rayleigh", "sggx", "tabphase"), INSIDE),
-    "volume": dict.fromkeys(("constvolume", "gridvolume"), INSIDE),
-    "bsdf": dict.fromkeys((
-        "blendbsdf", "bumpmap", "circular", "conductor", "dielectric", "diffuse", "hair", "mask", "measured",
-        "measured_polarized", "normalmap", "null", "plastic", "polarizer", "pplastic", "principled",
-        "principledthin", "retarder", "roughconductor", "roughdielectric", "roughplastic", "thindielectric",
-        "twosided",
-    ), AS_IS),
-    "shape": dict.fromkeys((
-        "blender", "bsplinecurve", "cube", "cylinder", "disk", "ellipsoids", "ellipsoidsmesh", "instance",
-        "linearcurve", "merge", "obj", "ply", "rectangle", "sdfgrid", "serialized", "shapegroup", "sphere",
-    ), AS_IS),
-    "texture": dict.fromkeys(("bitmap", "checkerboard", "mesh_attribute", "volume"), AS_IS),
-    "spectrum": dict.fromkeys((
-        "blackbody", "d65", "irregular", "rawconstant", "regular", "srgb", "uniform"), AS_IS),
-    "sampler": {
-        "independent": "gives way to `multijitter`",
-        **dict.fromkeys(("ldsampler", "multijitter", "orthogonal", "stratified"), "renders what is judged"),
-    },
-    "rfilter": dict.fromkeys(("box", "catmullrom", "gaussian", "lanczos", "mitchell", "tent"), AS_IS),
-}  # fmt: skip
-"""What happens with every plugin, by its kind."""
-
-
-def installed() -> set[str]:
-    return {path.stem for path in (Path(mi.__file__).parent / "plugins").iterdir() if path.suffix != ".py"}
-
-
-# ---- the page ----------------------------------------------------------------------------------------------
-
-HEAD = """\
-# Scenes
-
-What happens with scenes of each kind, and with each plugin of Mitsuba 3.9
-(`python -m tests.oracles.users_scenes > docs/scenes.md` writes the page).
-
-- **The map.** Without `--envmap` (`[input] envmap`), or with `envmap = "scene"`, the scene's environment
-  emitter is edited: the file of an `envmap`, or a map that `constant`, `sunsky` and `timed_sunsky` are
-  rendered to. With `--envmap`, the map takes its place, or lights a scene without one. Without it, shipped
-  scenes are lit by an analytic sky.
-- **Orientation and scale.** The `to_world` and `scale` of an `envmap` apply to any map; `[scene] scale`
-  replaces the scale, which is not in `edited.exr`. The zenith of `sunsky` is +z; for `constant`, and without
-  an emitter, it is the axis that is up for the first sensor, or `[scene] up`. A `to_world` that mirrors or
-  shears is refused.
-- **Several views.** `[scene] sensors = "all"`, or a list by `id` or by index from 0, makes every one a
-  picture; without it the first is used. They need the same width, and not `renderer.kind = "path"`.
-- **Variants.** `llvm_ad_rgb` and, on an NVIDIA GPU, `cuda_ad_rgb`; `metal_ad_rgb` was not tried. Spectra are
-  converted to RGB.
-
-[This experiment](../experiments/scenes/README.md) loads, renders and edits every Mitsuba scene of a folder.
-"""
-
-
 def happened(kind: Kind) -> str:
     """Return what a run says of a scene, or with what words it is refused."""
     with tempfile.TemporaryDirectory() as folder:
@@ -242,30 +150,3 @@ def happened(kind: Kind) -> str:
             return "; ".join(loaded(write(Path(folder), kind.parts))[2])
         except EnveditError as error:
             return f"refused: {str(error).replace(folder, '')}"
-
-
-def page() -> str:
-    lines = [HEAD, "## Kinds of scenes", "", "| scene | what happens |", "|---|---|"]
-    alike = {}
-    for kind in KINDS:
-        alike.setdefault(kind.happens.replace("<", "`<").replace(">", ">`"), []).append(kind.name)
-    lines += [f"| {'; '.join(names)} | {happens} |" for happens, names in alike.items()]
-    lines += ["", "## Plugins", "", "| kind | plugin | what happens |", "|---|---|---|"]
-    rows = []
-    whole_kinds = {}
-    for kind, plugins in PLUGINS.items():
-        by_what = {}
-        for name, what in plugins.items():
-            by_what.setdefault(what, []).append(f"`{name}`")
-        if len(by_what) == 1:
-            whole_kinds.setdefault(next(iter(by_what)), []).append(kind)
-        else:
-            rows += [f"| {kind} | {', '.join(names)} | {what} |" for what, names in by_what.items()]
-    rows += [f"| {', '.join(kinds)} | all of Mitsuba's | {what} |" for what, kinds in whole_kinds.items()]
-    lines += rows
-    return "\n".join(lines) + "\n"
-
-
-if __name__ == "__main__":
-    mi.set_variant("llvm_ad_rgb")
-    sys.stdout.write(page())

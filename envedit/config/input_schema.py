@@ -10,6 +10,8 @@ from envedit.config.stroke_schema import StrokeList
 from envedit.config.tables import EDITED, LAYERS, Table, key
 from envedit.config.validators import (
     MOST_DIM,
+    VIEW,
+    VIEWS,
     Boolean,
     Choice,
     Integer,
@@ -19,8 +21,6 @@ from envedit.config.validators import (
     Parameters,
     RowRange,
     String,
-    View,
-    ViewList,
     show,
 )
 from envedit.core import extensions
@@ -134,9 +134,11 @@ class Scene(Table):
     width: int = key(128, Integer(4, MOST_DIM), "width of the rendering while editing", "pixels")
     height: int = key(0, Integer(0, MOST_DIM), "height of the rendering; 0: by the scene's aspect", "pixels")
     sensors: str | tuple[int | str, ...] = key(
-        (0,), ViewList(), 'views that one map explains: a list of sensors, by id or index from 0, or "all"'
+        (0,), VIEWS, 'views that one map explains: a list of sensors, by id or index from 0, or "all"'
     )
-    parameters: dict[str, str | float | bool] = key({}, Parameters(), "values for the scene's `<default>`s")
+    parameters: dict[str, str | float | bool] = key(
+        {}, Parameters(), "values for the scene's `<default>`s: strings, numbers, booleans"
+    )
     up: str = key(
         "auto",
         Choice("auto", "x", "y", "z", "-x", "-y", "-z"),
@@ -185,7 +187,7 @@ class Target(Table):
     )
     view: int | str | tuple[int | str, ...] = key(
         (),
-        OneOrMore(View()),
+        OneOrMore(VIEW),
         "view that each file, or mask, belongs to: index or id; []: the first, the second, ...",
     )
     tonemap: str = key(

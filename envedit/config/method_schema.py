@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from envedit.config.tables import ADAM_STEPS, EDITED, LAYERS, SIREN, TRANSPORT, Table, key
-from envedit.config.validators import Boolean, Choice, Integer, Number, OrAuto, Ramp, String, Weight
+from envedit.config.validators import WEIGHT, Boolean, Choice, Integer, Number, OrAuto, Ramp, String
 from envedit.core import extensions
 from envedit.core.errors import ConfigError
 
@@ -93,16 +93,16 @@ class Fit(Table):
 class Loss(Table):
     """Weights of the edit's losses (Eq. 10): a number, or [start, end] for a geometric ramp over the run."""
 
-    ssim: Ramp = key(0.1, Weight(), "1 - SSIM of rendering and target")
-    luminance: Ramp = key(0.0, Weight(), "change of the map's summed luminance (Eq. 8)")
-    l1: Ramp = key(0.0, Weight(), "sum of the map's radiance (Eq. 9)")
+    ssim: Ramp = key(0.1, WEIGHT, "1 - SSIM of rendering and target")
+    luminance: Ramp = key(0.0, WEIGHT, "change of the map's summed luminance (Eq. 8)")
+    l1: Ramp = key(0.0, WEIGHT, "sum of the map's radiance (Eq. 9)")
     dists: Ramp | str = key(
-        0.0, OrAuto(Weight()), "DISTS of map and original; auto: 0.1 for a SIREN where weights are, else 0"
+        0.0, OrAuto(WEIGHT), "DISTS of map and original; auto: 0.1 for a SIREN where weights are, else 0"
     )
-    tv: Ramp = key(0.0, Weight(), "total variation of the map")
-    change: Ramp = key(0.0, Weight(), "mean change of the map's logarithm: what need not change stays")
-    image_l1: Ramp = key(1.0, Weight(), "mean absolute difference of rendering and target")
-    image_l2: Ramp = key((1.0, 100.0), Weight(), "mean squared difference of rendering and target")
+    tv: Ramp = key(0.0, WEIGHT, "total variation of the map")
+    change: Ramp = key(0.0, WEIGHT, "mean change of the map's logarithm: what need not change stays")
+    image_l1: Ramp = key(1.0, WEIGHT, "mean absolute difference of rendering and target")
+    image_l2: Ramp = key((1.0, 100.0), WEIGHT, "mean squared difference of rendering and target")
 
     def _check_together(self) -> None:
         if not self.ssim and not self.image_l1 and not self.image_l2:

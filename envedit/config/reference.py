@@ -8,12 +8,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from envedit.config import light_schema, region_schema, stroke_schema
+from envedit.config import light_schema
 from envedit.config.presets import MANY_PARAMETERS, PAINTED, PRESETS, SIREN
 from envedit.config.schema import FIELDS, TOP, Config
 from envedit.config.toml import quote
 from envedit.config.unused import condition
-from envedit.config.validators import Check
+from envedit.config.validators import Schema
 
 _HEAD = """\
 <!-- Generated: envedit schema --markdown > docs/configuration.md -->
@@ -43,6 +43,17 @@ complete its keys and check them.
 """
 
 
+_ENTRIES = {
+    "input.lights": "A light of the map (with `light`), or one that is added; see "
+    "[by hand](painting.md#move-lights). Radius of an added light where none is given: "
+    f"{light_schema.SIZE:g} degrees.",
+    "input.regions": "A region has one shape: points or polygon; see [regions of the map](regions.md).",
+    "target.strokes": "What each type does is said in [painting](painting.md). A stroke has one shape: "
+    "points, polygon, ellipse or rectangle; temperature, contrast and blur may have none.",
+}
+"""What is said above the keys of each list of tables."""
+
+
 def markdown() -> str:
     """Return the reference as Markdown."""
     made = {preset: Config(preset=preset) for preset in PRESETS}
@@ -52,10 +63,10 @@ def markdown() -> str:
         if only := condition(TOP[name].metadata["when"]):
             about += f" {only[0].upper()}{only[1:]}."
         parts.append(_keys(f"[{name}]", name, keys, made, about))
-        if name == "input":
-            parts += [_lights(), _regions()]
-        if name == "target":
-            parts.append(_strokes())
+        for key in (f"{name}.{key}" for key in keys if f"{name}.{key}" in _ENTRIES):
+            entry = FIELDS[name][key.partition(".")[2]].metadata["check"].schema()["items"]["properties"]
+            rows = [[f"`{k}`", values(schema), schema["description"]] for k, schema in entry.items()]
+            parts.append(f"### [[{key}]]\n\n{_ENTRIES[key]}\n\n{_table(['key', 'values', 'meaning'], rows)}")
     return "\n".join([*parts, _kinds()])
 
 
@@ -70,46 +81,45 @@ def _keys(title: str, table: str, keys: Iterable[str], made: Mapping[str, Config
         if key == "preset":
             defaults = ["standard"] * len(made)
         shown = [f"`{quote(value)}`" for value in defaults]
-        rows.append([f"`{key}`", _values(f.metadata["check"]), f.metadata["unit"], *shown, meaning])
+        rows.append([f"`{key}`", values(f.metadata["check"].schema()), f.metadata["unit"], *shown, meaning])
     head = ["key", "values", "unit", *made, "meaning"]
     return f"## {title}\n\n{about}{'' if not about else chr(10) * 2}{_table(head, rows)}"
 
 
-def _values(check: Check) -> str:
-    """Return type and range in a cell."""
-    return f"{check.kind}: {check.range}" if check.range else check.kind
+def values(schema: Schema) -> str:
+    """Say in a few words what a JSON Schema of :mod:`.validators` accepts."""
+    match schema:
+        case {"anyOf": options}:
+            return "; or ".join(map(values, options))
+        case {"enum": names}:
+            return ", ".join(f'"{name}"' for name in names)
+        case {"type": "array", "items": [*items], "minItems": least}:
+            count = len(items) if least == len(items) else f"{least} to {len(items)}"
+            each = {values(item) for item in items}
+            return f"list of {count}: {each.pop()}" if len(each) == 1 else f"list of {count} numbers"
+        case {"type": "array", "items": item}:
+            inner = f"({values(item)})" if "anyOf" in item or "items" in item else values(item)
+            inner += "s" * inner.isalpha()
+            return f"list of {inner}" + _bounds(schema.get("minItems"), schema.get("maxItems"), ", ")
+        case {"type": "object"}:
+            return "table"
+        case {"minimum": low, "maximum": high} if low == high:
+            return str(low)
+    low, high = schema.get("minimum"), schema.get("maximum")
+    if "exclusiveMinimum" in schema:
+        low = f"above {schema['exclusiveMinimum']}"
+    even = ", even" if "multipleOf" in schema else ""
+    return f"{schema['type']}{_bounds(low, high, ' ')}{even}"
 
 
-def _lights() -> str:
-    rows = []
-    for key, about in light_schema.MEANINGS.items():
-        checks = [keys[key] for keys in (light_schema.OWN, light_schema.ADDED) if key in keys]
-        rows.append([f"`{key}`", " / ".join(dict.fromkeys(map(_values, checks))), about])
-    default = f"Radius of an added light where none is given: {light_schema.SIZE:g} degrees."
-    about = "A light of the map (with `light`), or one that is added; see [by hand](painting.md#move-lights)."
-    return f"### [[input.lights]]\n\n{about} {default}\n\n{_table(['key', 'values', 'meaning'], rows)}"
-
-
-def _regions() -> str:
-    rows = [[f"`{key}`", _values(check), meaning] for key, (check, meaning) in region_schema.KEYS.items()]
-    about = "A region has one shape: points or polygon; see [regions of the map](regions.md)."
-    return f"### [[input.regions]]\n\n{about}\n\n{_table(['key', 'values', 'meaning'], rows)}"
-
-
-def _strokes() -> str:
-    rows = []
-    for key, checks in stroke_schema.stroke_keys().items():
-        defaults: dict[str, str] = {}
-        for kind, keys in (*stroke_schema.STROKES.items(), ("", stroke_schema.ANY_STROKE)):
-            if key in keys:
-                value = keys[key][0]
-                shown = "needed" if value is None else f"`{quote(value)}`"
-                defaults[kind] = f"{kind}: {shown}" if kind else shown
-        values = " / ".join(dict.fromkeys(map(_values, checks)))
-        rows.append([f"`{key}`", values, ", ".join(defaults.values()), stroke_schema.MEANINGS[key]])
-    about = "What each type does is said in [painting](painting.md). A stroke has one shape: points, polygon,"
-    about += " ellipse or rectangle; temperature, contrast and blur may have none."
-    return f"### [[target.strokes]]\n\n{about}\n\n{_table(['key', 'values', 'default', 'meaning'], rows)}"
+def _bounds(low: Any, high: Any, before: str) -> str:
+    """Say between which bounds something is, of which each may be None."""
+    low, high = (f"{bound:g}" if isinstance(bound, float) else bound for bound in (low, high))
+    if low is None:
+        return "" if high is None else f"{before}at most {high}"
+    if high is None:
+        return before + (low if str(low).startswith("above") else f"at least {low}")
+    return f"{before}{low} to {high}"
 
 
 def _kinds() -> str:

@@ -24,7 +24,7 @@ KEYS: dict[str, tuple[Check, str]] = {
     ),
     "points": (
         Points(_POINT, _DIRECTIONS, 1, MOST_POINTS),
-        "middle line of a brush, directions of the map in degrees",
+        "middle line of a brush, directions [azimuth, elevation] of the map in degrees",
     ),
     "radius": (Number(0, 180, positive=True), "of the brush, degrees; only with points, and needed there"),
     "polygon": (

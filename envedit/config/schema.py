@@ -19,7 +19,7 @@ from envedit.config import presets
 from envedit.config.input_schema import Input, Scene, Target
 from envedit.config.method_schema import Fit, Loss, Optimizer, Perceptual, Renderer, Representation, Solve
 from envedit.config.tables import ADAM_STEPS, EDITED, SIREN, Table, key, table_key
-from envedit.config.validators import Boolean, Choice, Integer, Kelvin, Number, OrAuto, String
+from envedit.config.validators import KELVIN, Boolean, Choice, Integer, Number, OrAuto, String
 from envedit.core.color import TONEMAPS
 from envedit.core.errors import ConfigError
 
@@ -56,13 +56,13 @@ class Output(Table):
     exposure: float = key(0.0, Number(-100, 100), "by how much the edited map is brightened at last", "stops")
     white_balance: float = key(
         0.0,
-        Kelvin(),
+        KELVIN,
         "temperature of the light that becomes neutral in the edited map; 0: as it is",
         "kelvin",
     )
     temperature: float = key(
         0.0,
-        Kelvin(),
+        KELVIN,
         "of the light in place of 6500 K, in all of the edited map: less is warmer; 0: as it is",
         "kelvin",
     )

@@ -5,6 +5,7 @@ What a stroke does is :mod:`envedit.targets.strokes`'s.
 
 from __future__ import annotations
 
+import json
 import re
 from dataclasses import dataclass
 from typing import Any
@@ -12,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from envedit.config.validators import (
+    VIEW,
     Check,
     Choice,
     Number,
@@ -19,7 +21,6 @@ from envedit.config.validators import (
     Points,
     Schema,
     Tables,
-    View,
     WantedError,
     named,
 )
@@ -39,8 +40,6 @@ _LINEAR = Numbers(*3 * [Number(0, 1e6)])
 class Color(Check):
     """[r, g, b], factors on linear radiance, or the sRGB colour "#rrggbb", which becomes them."""
 
-    kind = "list or string"
-    range = '3 numbers, 0 to 1e+06; or "#rrggbb"'
     words = '[r, g, b], or a colour such as "#ffd9a6"'
 
     def __call__(self, value: Any) -> list[float]:
@@ -58,8 +57,7 @@ class Color(Check):
 class Ellipse(Check):
     """Centre, radii and, if it is turned, degrees."""
 
-    kind = "list"
-    range = "[cx, cy, rx, ry] or [cx, cy, rx, ry, degrees]"
+    words = "[cx, cy, rx, ry] or [cx, cy, rx, ry, degrees]"
 
     def __call__(self, value: Any) -> list[float]:
         if not isinstance(value, list | tuple) or len(value) not in (4, 5):
@@ -73,8 +71,6 @@ class Ellipse(Check):
 class Rectangle(Check):
     """Upper left and lower right corner."""
 
-    kind = "list"
-    range = "[x0, y0, x1, y1]"
     words = "[x0, y0, x1, y1] with x1 above x0 and y1 above y0"
 
     def __call__(self, value: Any) -> list[float]:
@@ -120,14 +116,14 @@ ANY_STROKE: dict[str, tuple[Any, Check]] = {
 
 MEANINGS = {
     "type": "what it does to the rendering",
-    "points": "middle line of a brush, x to the right and y downwards from the upper left corner",
+    "points": "middle line of a brush: [x, y], to the right and downwards from the upper left corner",
     "width": "of the brush; only with points, and needed there",
     "polygon": "corners of a region",
-    "ellipse": "centre, radii and turn of a region",
-    "rectangle": "corners of a region",
+    "ellipse": "[cx, cy, rx, ry] or [cx, cy, rx, ry, degrees]: centre, radii and turn of a region",
+    "rectangle": "[x0, y0, x1, y1]: corners of a region",
     "view": "view that it is painted on: index or id",
     "amount": "shadow: share of the light taken; light: radiance added; contrast: factor",
-    "color": "factors on linear radiance, or a display colour",
+    "color": 'factors on linear radiance, or a display colour, "#rrggbb"',
     "kelvin": "temperature: of the light in place of 6500 K",
     "radius": "blur: standard deviation of the Gaussian",
     "units": "of all lengths: shares of the picture's width and height, or pixels",
@@ -148,7 +144,7 @@ class StrokeList(Tables):
         kind = named(f"{name}.type", Choice(*STROKES), stroke["type"])
         own = STROKES[kind] | ANY_STROKE
         checks = {key: check for key, (_, check) in own.items()}
-        checks = {"type": Choice(kind), **SHAPES, "width": _LENGTH, "view": View(), **checks}
+        checks = {"type": Choice(kind), **SHAPES, "width": _LENGTH, "view": VIEW, **checks}
         defaults = {key: default for key, (default, _) in own.items() if default is not None}
         found = self._checked(name, defaults | stroke, checks)
 
@@ -164,19 +160,19 @@ class StrokeList(Tables):
         return found
 
     def schema(self) -> Schema:
+        checks: dict[str, list[Check]] = {"type": [Choice(*STROKES)], **{k: [c] for k, c in SHAPES.items()}}
+        checks |= {"width": [_LENGTH], "view": [VIEW]}
+        defaults: dict[str, list[str]] = {}
+        for kind, keys in (*STROKES.items(), ("every type", ANY_STROKE)):
+            for key, (default, check) in keys.items():
+                checks.setdefault(key, []).append(check)
+                value = "needed" if default is None else json.dumps(default)
+                defaults.setdefault(key, []).append(f"{kind}: {value}")
+
         properties: Schema = {}
-        for key, checks in stroke_keys().items():
-            each = [check.schema() for check in dict.fromkeys(checks)]
-            properties[key] = each[0] if len(each) == 1 else {"anyOf": each}
-            properties[key] = {**properties[key], "description": MEANINGS[key]}
+        for key, options in checks.items():
+            each = [check.schema() for check in dict.fromkeys(options)]
+            default = f" (default of {', '.join(defaults[key])})" if key in defaults else ""
+            about = {"description": MEANINGS[key] + default}
+            properties[key] = (each[0] if len(each) == 1 else {"anyOf": each}) | about
         return self._schema_of({"properties": properties, "required": ["type"]})
-
-
-def stroke_keys() -> dict[str, list[Check]]:
-    """Return every key that a stroke may have, with its check in each type that has it."""
-    found: dict[str, list[Check]] = {"type": [Choice(*STROKES)], **{k: [c] for k, c in SHAPES.items()}}
-    found |= {"width": [_LENGTH], "view": [View()]}
-    for keys in (*STROKES.values(), ANY_STROKE):
-        for key, (_, check) in keys.items():
-            found.setdefault(key, []).append(check)
-    return found

@@ -1,9 +1,8 @@
 """Checks of configuration values: objects that say what they accept, and normalise a value or refuse it.
 
 A check is called with a value and returns it normalised, or raises :class:`WantedError`. ``str(check)`` is
-what an error says it expected, ``check.schema()`` the same as JSON Schema, ``check.kind`` and ``check.range``
-are for the reference of the configuration (:mod:`envedit.config.reference`). Numbers must fit single
-precision, in which everything is computed.
+what an error says it expected, ``check.schema()`` the same as JSON Schema. Numbers must fit single precision,
+in which everything is computed.
 
 >>> Integer(1, 8)(3), str(Integer(1, 8)), Integer(1, 8).schema()
 (3, 'an integer from 1 to 8', {'type': 'integer', 'minimum': 1, 'maximum': 8})
@@ -40,17 +39,7 @@ class WantedError(Exception):
 class Check(ABC):
     """What a key may be."""
 
-    words: str = ""  # what is accepted, as the end of a sentence; "": as :attr:`range`
-
-    @property
-    def kind(self) -> str:
-        """Its type in a word or two."""
-        return ""
-
-    @property
-    def range(self) -> str:
-        """Which values of that type; "" for all."""
-        return ""
+    words: str = ""  # what is accepted, as the end of a sentence
 
     @abstractmethod
     def __call__(self, value: Any) -> Any:
@@ -62,7 +51,7 @@ class Check(ABC):
 
     def __str__(self) -> str:
         """Say what is accepted, as the end of a sentence."""
-        return self.words or self.range
+        return self.words
 
 
 class Tables(Check):
@@ -72,7 +61,6 @@ class Tables(Check):
     an unusable value; WantedError if it is no list of tables, or too long.
     """
 
-    kind = "list of tables"
     words = "a list of tables"
     name: str  # of the key, "input.lights"
     most: int | None = None  # entries; None: any number
@@ -81,7 +69,7 @@ class Tables(Check):
         if not isinstance(value, list | tuple) or not all(isinstance(v, dict) for v in value):
             raise WantedError(str(self))
         if self.most is not None and len(value) > self.most:
-            raise WantedError(f"{self.range} {self.name.split('.')[1]}")
+            raise WantedError(f"at most {self.most} {self.name.split('.')[1]}")
         return tuple(self._entry(f"{self.name}[{i}]", v) for i, v in enumerate(value))
 
     @abstractmethod
@@ -100,10 +88,6 @@ class Tables(Check):
         if not needed and key in found:
             raise ConfigError(f"{name}.{key}: got {show(found[key])}, expected none but {where}")
 
-    @property
-    def range(self) -> str:
-        return "" if self.most is None else f"at most {self.most}"
-
     def _schema_of(self, table: Schema) -> Schema:
         """Return that of the list, given what entries have beside being tables of these properties."""
         entry = {"type": "object", **table, "additionalProperties": False}
@@ -118,7 +102,6 @@ class String(Check):
     """Text or a path, as text of at least so many characters."""
 
     least: int = 0
-    kind = "string"
     words = "a string"
 
     def __call__(self, value: Any) -> str:
@@ -138,7 +121,6 @@ class String(Check):
 class Boolean(Check):
     """True or false."""
 
-    kind = "boolean"
     words = "true or false"
 
     def __call__(self, value: Any) -> bool:
@@ -152,8 +134,6 @@ class Boolean(Check):
 
 class Choice(Check):
     """One of some names, or of those that installed packages add to a group of entry points."""
-
-    kind = "string"
 
     def __init__(self, *names: str, group: str = "") -> None:
         self.names = names
@@ -172,10 +152,6 @@ class Choice(Check):
     def __str__(self) -> str:
         return f"one of {', '.join([*self.names, *self._added])}"
 
-    @property
-    def range(self) -> str:
-        return ", ".join(f'"{name}"' for name in self.names)
-
     def schema(self) -> Schema:
         return {"enum": [*self.names, *self._added]}
 
@@ -190,7 +166,6 @@ class Integer(Check):
     low: int
     high: int
     even: bool = False
-    kind = "integer"
 
     def __call__(self, value: Any) -> int:
         whole = isinstance(value, Integral) and not isinstance(value, bool)
@@ -200,10 +175,6 @@ class Integer(Check):
 
     def __str__(self) -> str:
         return f"an {'even ' if self.even else ''}integer from {self.low} to {self.high}"
-
-    @property
-    def range(self) -> str:
-        return f"{'even, ' if self.even else ''}{self.low} to {self.high}"
 
     def schema(self) -> Schema:
         limits: Schema = {"type": "integer", "minimum": self.low, "maximum": self.high}
@@ -217,7 +188,6 @@ class Number(Check):
     low: float
     high: float = math.inf
     positive: bool = False
-    kind = "number"
 
     def __call__(self, value: Any) -> float:
         if not isinstance(value, Real) or isinstance(value, bool):
@@ -238,12 +208,6 @@ class Number(Check):
         text = f"a number {'above' if self.positive else 'of at least'} {self.low:g}"
         return text if math.isinf(self.high) else f"{text} and at most {self.high:g}"
 
-    @property
-    def range(self) -> str:
-        if math.isinf(self.high):
-            return "" if math.isinf(self.low) else f"{'above' if self.positive else 'at least'} {self.low:g}"
-        return f"{'above ' if self.positive else ''}{self.low:g} to {self.high:g}"
-
     def schema(self) -> Schema:
         limits: Schema = {"type": "number"}
         if not math.isinf(self.low):
@@ -253,8 +217,6 @@ class Number(Check):
 
 class Numbers(Check):
     """A list with one value for each of some checks."""
-
-    kind = "list"
 
     def __init__(self, *checks: Check) -> None:
         self.checks = checks
@@ -266,11 +228,6 @@ class Numbers(Check):
 
     def __str__(self) -> str:
         return f"a list of {len(self.checks)} numbers"
-
-    @property
-    def range(self) -> str:
-        same = len({check.range for check in self.checks}) == 1 and self.checks[0].range
-        return f"{len(self.checks)} numbers{f', each {same}' if same else ''}"
 
     def schema(self) -> Schema:
         items = [check.schema() for check in self.checks]
@@ -285,7 +242,6 @@ class Points(Check):
     names: str  # of the two numbers
     least: int
     most: int | None = None
-    kind = "list"
 
     def __call__(self, value: Any) -> list[list[float]]:
         most = math.inf if self.most is None else self.most
@@ -299,8 +255,7 @@ class Points(Check):
                 raise WantedError(f"{error} at point {i}") from None
         return points
 
-    @property
-    def range(self) -> str:
+    def __str__(self) -> str:
         count = f"at least {self.least}" if self.most is None else f"{self.least} to {self.most}"
         return f"[[{self.names}], ...], {count}"
 
@@ -322,10 +277,35 @@ class Pair(Numbers):
 # ---- what other checks accept ------------------------------------------------------------------------------
 
 
+class ListOf(Check):
+    """A list of what another check accepts, as a tuple."""
+
+    words = "a list"
+
+    def __init__(self, check: Check, least: int = 0, unique: bool = False) -> None:
+        self.check = check
+        self.least = least
+        self.unique = unique
+
+    def __call__(self, value: Any) -> tuple[Any, ...]:
+        if not isinstance(value, list | tuple) or len(value) < self.least:
+            raise WantedError(self.words)
+        values = tuple(self.check(v) for v in value)
+        if self.unique and len({*values}) < len(values):
+            raise WantedError(self.words)
+        return values
+
+    def schema(self) -> Schema:
+        values: Schema = {"type": "array", "items": self.check.schema()}
+        return values | ({"minItems": self.least} if self.least else {}) | {"uniqueItems": self.unique}
+
+
 class Either(Check):
     """What one of several checks accepts, in words of its own."""
 
-    checks: tuple[Check, ...]
+    def __init__(self, words: str, *checks: Check) -> None:
+        self.words = words
+        self.checks = checks
 
     def __call__(self, value: Any) -> Any:
         for check in self.checks:
@@ -337,86 +317,47 @@ class Either(Check):
         return {"anyOf": [check.schema() for check in self.checks]}
 
 
-@dataclass(frozen=True)
-class OrAuto(Check):
+class OrAuto(Either):
     """The word "auto" beside what another check accepts."""
 
-    check: Check
-
-    def __call__(self, value: Any) -> Any:
-        try:
-            return value if isinstance(value, str) and value == "auto" else self.check(value)
-        except WantedError as error:
-            raise WantedError(f'{error}, or "auto"') from None
-
-    def __str__(self) -> str:
-        return f'{self.check}, or "auto"'
-
-    @property
-    def kind(self) -> str:
-        return self.check.kind
-
-    @property
-    def range(self) -> str:
-        return f'{self.check.range or self.check}; or "auto"'
-
-    def schema(self) -> Schema:
-        return {"anyOf": [{"const": "auto"}, self.check.schema()]}
+    def __init__(self, check: Check) -> None:
+        super().__init__(f'{check}, or "auto"', check, Choice("auto"))
 
 
-@dataclass(frozen=True)
-class OneOrMore(Check):
+class OneOrMore(Either):
     """A value, or a list of values, as a tuple."""
 
-    check: Check
-
-    def __call__(self, value: Any) -> Any:
-        try:
-            if isinstance(value, list | tuple):
-                return tuple(self.check(v) for v in value)
-            return self.check(value)
-        except WantedError as error:
-            raise WantedError(f"{error}, or a list of them") from None
-
-    def __str__(self) -> str:
-        return f"{self.check}, or a list of them"
-
-    @property
-    def kind(self) -> str:
-        return f"{self.check.kind} or list"
-
-    def schema(self) -> Schema:
-        return {"anyOf": [self.check.schema(), {"type": "array", "items": self.check.schema()}]}
+    def __init__(self, check: Check) -> None:
+        super().__init__(f"{check}, or a list of them", check, ListOf(check))
 
 
 # ---- single keys -------------------------------------------------------------------------------------------
 
-
-class Kelvin(Either):
-    """A colour temperature for which there are chromaticities, or 0."""
-
-    kind = "number"
-    range = "0, or 2000 to 25000"
-    words = "0, or kelvin from 2000 to 25000"
-    checks = Number(0, 0), Number(2000, 25000)
-
-
-class Weight(Either):
-    """A constant weight, or the two ends of a geometric ramp."""
-
-    kind = "number or list"
-    range = "at least 0; or [start, end], both above 0"
-    words = "a number of at least 0, or [start, end], both above 0"
-    checks = Number(0), Pair(Number(0, positive=True))
+KELVIN = Either("0, or kelvin from 2000 to 25000", Number(0, 0), Number(2000, 25000))
+"""A colour temperature for which there are chromaticities, or 0."""
+WEIGHT = Either(
+    "a number of at least 0, or [start, end], both above 0", Number(0), Pair(Number(0, positive=True))
+)
+"""A constant weight, or the two ends of a geometric ramp."""
+VIEW = Either("the id of a sensor, or the index of a view from 0", String(least=1), Integer(0, MOST_DIM))
+"""A view: the id of its sensor, or its index."""
+VIEWS = Either(
+    '"all", or a list of ids of sensors or of indices from 0, each once',
+    Choice("all"),
+    ListOf(VIEW, least=1, unique=True),
+)
+"""Sensors of a scene."""
 
 
 class RowRange(Either):
     """The rows that an edit may change: a name, or the first and last of them."""
 
-    kind = "string or list"
-    range = '"upper", "all" or [first, last]'
-    words = '"upper", "all" or [first, last], rows from 0 at the zenith, last included'
-    checks = Choice("upper", "all"), Pair(Integer(0, MOST_DIM))
+    def __init__(self) -> None:
+        super().__init__(
+            '"upper", "all" or [first, last], rows from 0 at the zenith, last included',
+            Choice("upper", "all"),
+            Pair(Integer(0, MOST_DIM)),
+        )
 
     def __call__(self, value: Any) -> str | tuple[int, int]:
         rows = super().__call__(value)
@@ -425,42 +366,10 @@ class RowRange(Either):
         return rows
 
 
-class View(Either):
-    """A view: the id of its sensor, or its index."""
-
-    kind = "string or integer"
-    words = "the id of a sensor, or the index of a view from 0"
-    checks = String(least=1), Integer(0, MOST_DIM)
-
-
-class ViewList(Check):
-    """Sensors of a scene: "all", or a list of ids and of indices from 0, none of them twice."""
-
-    kind = "string or list"
-    range = '"all", or ids and indices from 0'
-    words = '"all", or a list of ids of sensors or of indices from 0, each once'
-
-    def __call__(self, value: Any) -> str | tuple[int | str, ...]:
-        if isinstance(value, str) and value == "all":
-            return value
-        try:
-            if isinstance(value, list | tuple) and value and len({*value}) == len(value):
-                return tuple(View()(v) for v in value)
-        except (TypeError, WantedError):
-            pass
-        raise WantedError(str(self))
-
-    def schema(self) -> Schema:
-        views: Schema = {"type": "array", "items": View().schema(), "minItems": 1, "uniqueItems": True}
-        return {"anyOf": [{"const": "all"}, views]}
-
-
 class Parameters(Check):
     """A flat table of strings, numbers and booleans."""
 
-    kind = "table"
-    range = "of strings, numbers and booleans"
-    words = f"a table {range}"
+    words = "a table of strings, numbers and booleans"
 
     def __call__(self, value: Any) -> dict[str, str | float | bool]:
         if not isinstance(value, dict):

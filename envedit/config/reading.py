@@ -78,9 +78,7 @@ def loads(
     except RecursionError:
         raise ConfigError(f"{name}: not TOML: nested too deeply") from None
     except ValueError as error:  # TOMLDecodeError, or an integer of thousands of digits
-        row, column = text.count("\n") + 1, len(text) - (text.rfind("\n") + 1) + 1
-        end = f"at line {row}, column {column}: end of document"
-        reason = str(error).replace("at end of document", end)
+        reason = str(error)
         if len(reason) > 200:  # it may hold a key of any length; its end says where
             reason = f"{reason[:120]} ... {reason[-60:]}"
         raise ConfigError(f"{name}: not TOML: {reason}") from None

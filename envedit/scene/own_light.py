@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import math
 from dataclasses import dataclass
 
@@ -95,10 +94,8 @@ class OwnLight:
 def _edges(values):
     """Mark samples (h, w), periodic in w, whose neighbourhood of 3x3 differs by :data:`CONTRAST`."""
     padded = np.pad(np.pad(values, ((0, 0), (1, 1)), mode="wrap"), ((1, 1), (0, 0)), mode="edge")
-    height, width = values.shape
-    around = [padded[i : i + height, j : j + width] for i in range(3) for j in range(3)]
-    low = functools.reduce(np.minimum, around)
-    return functools.reduce(np.maximum, around) > CONTRAST * np.maximum(low, 0)
+    around = np.lib.stride_tricks.sliding_window_view(padded, (3, 3))
+    return around.max(axis=(2, 3)) > CONTRAST * np.maximum(around.min(axis=(2, 3)), 0)
 
 
 def _alone(state, index):

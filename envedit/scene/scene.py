@@ -20,11 +20,10 @@ which stay as they are.
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import hashlib
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -264,8 +263,8 @@ def load(
 
     ``parameters``, ``base`` and ``sensors`` are those of :func:`.api.load_scene`. The scene is lit by a grey
     map until :meth:`Scene.set_envmap` or :meth:`Scene.render` sets another. ConfigError if a parameter or
-    sensor is unknown, missing or unusable, or the size is. InputError if files are missing or damaged, the
-    scene has several environment emitters, or something that is not supported; all that is found is named.
+    sensor is unknown, missing or unusable, or the size is. InputError if files are missing or damaged, all of
+    which are named, the scene has several environment emitters, or something that is not supported.
 
     ``file`` is a Mitsuba XML file, a USD file (:func:`.usd.conversion.kept`), the name of a shipped scene
     (:func:`.shipped.scenes`, with or without ``.xml``; a file of that name in the working folder comes
@@ -283,25 +282,18 @@ def load(
     width, height = _whole("width", width or 0, 0), _whole("height", height or 0, 0)
     config, state, path, where, folders = _parsed(file, parameters, base)
 
-    # ---- What is read of emitter, integrator and sensors; all refusals are raised at once
-    refused = _Refusals()
-    sensor_indices: list[int] = []
-    with refused.collected():
-        own = supported.own_map(state, where, folders, scale)
-    with refused.collected():
-        integrator = supported.take_integrator(state, where)
+    # ---- What is read of emitter, integrator and sensors
+    own = supported.own_map(state, where, folders, scale)
+    integrator = supported.take_integrator(state, where)
     if usd.is_usd(file) and sensors != "all" and tuple(sensors) == (0,):
         supported.require_one_sensor(state, where)
-    with refused.collected():
-        sensor_indices, names, sensor_notes = supported.take_sensors(state, where, sensors)
+    sensor_indices, names, sensor_notes = supported.take_sensors(state, where, sensors)
 
     # ---- What is changed of film, emitter, BSDFs, files and shapes
     for sensor in sensor_indices:
-        with refused.collected():
-            parser.set_film(state, where, sensor, width, height)
-    with refused.collected():
-        emitter, to_world, turned = parser.replace_environment(state, where, up)
-    _change_nodes(state, where, folders, refused)
+        parser.set_film(state, where, sensor, width, height)
+    emitter, to_world, turned = parser.replace_environment(state, where, up)
+    _change_nodes(state, where, folders)
 
     # ---- Notes, files and digest
     first = usd.kept(path).notes if path is not None and usd.is_usd(path) else ()
@@ -356,48 +348,24 @@ def load(
     )
 
 
-class _Refusals:
-    """What a scene is refused for, to be said at once."""
-
-    def __init__(self) -> None:
-        self.errors: list[EnveditError] = []
-
-    @contextlib.contextmanager
-    def collected(self) -> Iterator[None]:
-        """Keep a refusal for :meth:`raise_all` and go on."""
-        try:
-            yield
-        except (ConfigError, InputError) as error:
-            self.errors.append(error)
-
-    def raise_all(self) -> None:
-        """Raise all that was refused, each thing once, in an error of the first one's kind."""
-        if not self.errors:
-            return
-        first, *others = dict.fromkeys(map(str, self.errors))
-        if not others:
-            raise self.errors[0]
-        lines = [text.replace("\n", ", ") for text in (first, "; ".join(others))]
-        raise type(self.errors[0])(f"{lines[0]}\nalso: {lines[1]}")
-
-
-def _change_nodes(state, where, folders, refused):
-    """Change BSDFs, find the files that nodes name, and fit shapes; raises what was refused."""
+def _change_nodes(state, where, folders):
+    """Change BSDFs, find the files that nodes name, and fit shapes; all files that are wrong are named."""
     for node in state.nodes:
-        with refused.collected():
-            parser.smooth_limit(state, node)
+        parser.smooth_limit(state, node)
     files = []
+    wrong = []
     for node in state.nodes:
-        with refused.collected():
+        try:
             if file := parser.find_file(state, node, where, folders):
                 files.append(file)
-    with refused.collected():
-        refused.errors += scene_files.errors(files)
-    refused.raise_all()  # no file is loaded
+        except InputError as error:
+            wrong.append(error)
+    wrong += scene_files.errors(files)
+    if wrong:
+        first, *others = dict.fromkeys(str(error).replace("\n", ", ") for error in wrong)
+        raise InputError(f"{first}\nalso: {'; '.join(others)}" if others else str(wrong[0]))
     for node in state.nodes:
-        with refused.collected():
-            parser.fit_to_stage(state, node)
-    refused.raise_all()
+        parser.fit_to_stage(state, node)
 
 
 def views_of(scene: mi.Scene, names: Sequence[str]) -> tuple[int, tuple[View, ...]]:
@@ -443,11 +411,8 @@ def _parsed(file, parameters, base):
     parser.check_references(state, where)
     parser.called(where, mi.parser.transform_all, config, state)
     installed_plugins.come_first()
-    refused = _Refusals()
     for node in state.nodes:
-        with refused.collected():
-            parser.check_plugin(state, node, where)
-    refused.raise_all()  # nothing else is loaded
+        parser.check_plugin(state, node, where)
     return config, state, path, where, folders
 
 
@@ -469,7 +434,7 @@ def relit(
     _, state, _, where, folders = _parsed(file, parameters, base)
     own = supported.own_map(state, where, folders, scale)
     emitter, _, _ = parser.replace_environment(state, where, up)
-    _change_nodes(state, where, folders, _Refusals())
+    _change_nodes(state, where, folders)
     emitter["filename"] = envmap
     emitter["scale"] = own.scale
     if not any(node.type == mi.ObjectType.Integrator for node in state.nodes):

@@ -92,7 +92,7 @@ def test_an_override_without_key_or_value_is_refused(text):
     ("[input]\nwidth = 128\nrows = [0, 64]", ["input.rows: got [0, 64], expected rows below 64"]),
     ("[loss]\nssim = 0\nimage_l1 = 0\nimage_l2 = 0", ["loss.ssim, loss.image_l1, loss.image_l2: got 0"]),
     ("[fit]\nlog_mse = 0\nlog_ssim = 0\nhdr = 0", ["got 0 for all"]),
-    ("a = ", ["not TOML", "at line 1, column 5", "end of document"]),
+    ("a = ", ["not TOML", "end of document"]),
     ("[fit]\nepochs = = 3", ["a.toml: not TOML", "at line 2, column 10"]),
     ("x = " + "[" * 5000, ["not TOML", "nested too deeply"]),
     ("seed = " + "9" * 5000, ["not TOML"]),

@@ -5,14 +5,14 @@ Written from the fields, their checks and the presets, so that it cannot differ 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Sequence
 from typing import Any
 
 from envedit.config import light_schema
+from envedit.config.json_schema import json_schema
 from envedit.config.presets import MANY_PARAMETERS, PAINTED, PRESETS, SIREN
 from envedit.config.schema import FIELDS, TOP, Config
 from envedit.config.toml import quote
-from envedit.config.unused import condition
 from envedit.config.validators import Schema
 
 _HEAD = """\
@@ -56,34 +56,29 @@ _ENTRIES = {
 
 def markdown() -> str:
     """Return the reference as Markdown."""
-    made = {preset: Config(preset=preset) for preset in PRESETS}
-    parts = [_HEAD, _keys("Top of the file", "", [k for k in TOP if k not in FIELDS], made)]
-    for name, keys in FIELDS.items():
-        about = (TOP[name].metadata["table"].__doc__ or "").partition("\n\n")[0]
-        if only := condition(TOP[name].metadata["when"]):
-            about += f" {only[0].upper()}{only[1:]}."
-        parts.append(_keys(f"[{name}]", name, keys, made, about))
-        for key in (f"{name}.{key}" for key in keys if f"{name}.{key}" in _ENTRIES):
-            entry = FIELDS[name][key.partition(".")[2]].metadata["check"].schema()["items"]["properties"]
-            rows = [[f"`{k}`", values(schema), schema["description"]] for k, schema in entry.items()]
-            parts.append(f"### [[{key}]]\n\n{_ENTRIES[key]}\n\n{_table(['key', 'values', 'meaning'], rows)}")
+    schema = json_schema()["properties"]
+    presets = [Config(preset=preset) for preset in PRESETS]
+    top = {key: schema[key] for key in TOP if key not in FIELDS}
+    parts = [_HEAD, _section("## Top of the file", "", top, presets)]
+    for name in FIELDS:
+        table = schema[name]
+        defaults = [getattr(preset, name) for preset in presets]
+        parts.append(_section(f"## [{name}]", table["description"], table["properties"], defaults))
+        for key, about in _ENTRIES.items():
+            if key.startswith(f"{name}."):
+                entries = table["properties"][key.removeprefix(f"{name}.")]["items"]
+                parts.append(_section(f"### [[{key}]]", about, entries["properties"]))
     return "\n".join([*parts, _kinds()])
 
 
-def _keys(title: str, table: str, keys: Iterable[str], made: Mapping[str, Config], about: str = "") -> str:
-    """Return the section of a table."""
+def _section(title: str, about: str, properties: Schema, presets: Sequence[Any] = ()) -> str:
+    """Return the section of some keys; ``presets``: what has their defaults in each preset."""
     rows = []
-    for key in keys:
-        f = FIELDS[table][key] if table else TOP[key]
-        only = condition(f.metadata["when"])
-        meaning = f.metadata["doc"] + (f"; *{only}*" if only else "")
-        defaults = [getattr(getattr(c, table) if table else c, key) for c in made.values()]
-        if key == "preset":
-            defaults = ["standard"] * len(made)
-        shown = [f"`{quote(value)}`" for value in defaults]
-        rows.append([f"`{key}`", values(f.metadata["check"].schema()), f.metadata["unit"], *shown, meaning])
-    head = ["key", "values", "unit", *made, "meaning"]
-    return f"## {title}\n\n{about}{'' if not about else chr(10) * 2}{_table(head, rows)}"
+    for key, schema in properties.items():
+        defaults = [f"`{quote(getattr(preset, key))}`" for preset in presets]
+        rows.append([f"`{key}`", values(schema), *defaults, schema["description"]])
+    head = ["key", "values", *(PRESETS if presets else ()), "meaning"]
+    return "\n\n".join(filter(None, (title, about, _table(head, rows))))
 
 
 def values(schema: Schema) -> str:

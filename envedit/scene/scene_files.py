@@ -2,8 +2,8 @@
 
 Mitsuba 3.9 believes the sizes and indices that a file states: it stops the process on a damaged one, takes
 the memory that a header declares, and repeats lines of a file that is something else. Whatever happens to the
-other process becomes an error that names the file. What it has read well is remembered by content, here and
-in the folder of caches, and not tried again. Why so: ``docs/decisions/files_of_scenes.md``.
+other process becomes an error that names the file. What it has read well is remembered by content in the
+folder of caches, and not tried again. Why so: ``docs/decisions/files_of_scenes.md``.
 """
 
 from __future__ import annotations
@@ -47,7 +47,6 @@ importlib.import_module(module).main(*arguments)
 """Runs ``main`` of a module in a process of its own, which reads ``sys.path``, the module's name and
 arguments from standard input, as JSON."""
 _HINTS = {"ply": ", as triangles", "spectrum": ", as NAME.spd"}  # what Mitsuba reads of these
-_remembered: set[str] = set()
 
 
 class SceneFile(NamedTuple):
@@ -69,7 +68,7 @@ def errors(files: Sequence[SceneFile]) -> list[InputError]:
     for file in files:
         if file.plugin in PLUGINS and not shipped.holds(Path(file.path)):
             key = _key(file)
-            if key not in _remembered and store.load({"good": key}) is None:
+            if store.load({"good": key}) is None:
                 unknown[key] = file
     wrong = []
     while unknown:  # files without an answer are tried again
@@ -78,7 +77,6 @@ def errors(files: Sequence[SceneFile]) -> list[InputError]:
             if answer:
                 wrong.append(InputError(f"{path}: {answer}"))
             else:
-                _remembered.add(key)
                 store.store({"good": key}, {})
     return wrong
 

@@ -1,5 +1,6 @@
 """The configuration explains itself: JSON Schema, the page of all keys, and keys that change nothing."""
 
+import contextlib
 import dataclasses
 import json
 import math
@@ -46,27 +47,41 @@ def edges(check):
 
 
 LIGHTS = [{"azimuth": 1, "elevation": 2, "flux": [1, 2, 3]}]
-# What JSON Schema cannot say of a value by itself: rows in order, 1.0 being no integer, and what is refused
-# with the name of a key inside.
+# What JSON Schema cannot say of a value by itself: rows in order, and what is refused with the name of a key
+# inside.
 LOOSER = {"input.rows", "input.lights", "target.strokes"}
 
 
+# Neither can it say which numbers single precision has, that a path has no NUL, and that 1.0 is no integer.
+UNSAID = math.nan, math.inf, 1e-46, 1e39, "a\0", 1.0
+
+
 @pytest.mark.parametrize("name", CHECKS)
-def test_schema_and_check_of_a_key_accept_the_same(name):
+def test_a_key_is_accepted_and_comes_back_or_is_refused_by_name_as_its_schema_says(name):
     check = CHECKS[name]
     table, _, key = name.rpartition(".")
     keys = SCHEMA["properties"][table]["properties"] if table else SCHEMA["properties"]
     jsonschema.Draft7Validator.check_schema(keys[key])
     taken = refused = 0
-    for value in edges(check):
+    for value in (*edges(check), *UNSAID):
+        given = {table: {key: value}} if table else {key: value}
         try:
             check(value)
         except (WantedError, ConfigError):
             refused += 1
-            assert name in LOOSER or not accepts(keys[key], value), value
+            unsaid = any(value is odd for odd in UNSAID)
+            assert name in LOOSER or unsaid or not accepts(keys[key], value), value
+            with pytest.raises(ConfigError) as error:
+                config.from_dict(given)
+            message = str(error.value)
+            assert message.startswith(f"config.toml: {name}") and len(message.splitlines()) == 1
+            assert name in LOOSER or message.count(", expected ") == 1, message
         else:
             taken += 1
             assert accepts(keys[key], value), value
+            with contextlib.suppress(ConfigError):  # it may contradict the defaults of others
+                made = config.from_dict(given, "/maps")
+                assert config.loads(config.to_toml(made), "/elsewhere", "b.toml") == made
     assert taken and refused and str(check)
     assert accepts(keys[key], keys[key]["default"]) and keys[key]["description"]
 

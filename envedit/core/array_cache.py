@@ -26,7 +26,7 @@ from envedit.core.errors import InputError
 
 MOST_BYTES = 4_000_000_000
 """Size above which a folder loses the entries that were not used for longest."""
-KEY = "key"
+KEY = "__key__"
 """Name of the array in an entry that holds its key."""
 _OURS = re.compile(r"[0-9a-f]{32}\.arrays|(?P<temporary>\.[0-9a-f]{32}\.arrays\.\d+)")
 _ABANDONED = 3600.0  # seconds after which a temporary file belongs to no writer that is still alive

@@ -192,7 +192,7 @@ def test_a_header_is_not_believed(header, tmp_path):
     key = io.BytesIO()
     np.save(key, np.array(json.dumps(KEY, sort_keys=True).encode()))
     with zipfile.ZipFile(cache._path(KEY), "w") as archive:
-        archive.writestr("key.npy", key.getvalue())
+        archive.writestr(f"{array_cache.KEY}.npy", key.getvalue())
         archive.writestr("a.npy", b"\x93NUMPY\1\0\x76\0" + body)
     assert cache.load(KEY) is None
 

@@ -302,14 +302,11 @@ class Target(Table):
         if self.kind in ("image", "photo") and not self.file:
             what = "painted image" if self.kind == "image" else "photograph"
             raise ConfigError(f'target.file: got "", expected the {what}, as target.kind is "{self.kind}"')
-        if self.kind == "none" and (self.file or self.mask):
-            raise ConfigError('target.file, target.mask: got one, expected none, as target.kind is "none"')
-        if self.kind == "strokes" and self.file:
-            raise ConfigError(
-                f"target.file: got {show(self.file)}, expected none: strokes go on the initial rendering"
-            )
-        if self.kind == "strokes" and self.mask:
-            raise ConfigError(f"target.mask: got {show(self.mask)}, expected none: strokes have a place")
+        for name in ("file", "mask"):
+            if self.kind in ("none", "strokes") and (given := getattr(self, name)):
+                raise ConfigError(
+                    f'target.{name}: got {show(given)}, expected none, as target.kind is "{self.kind}"'
+                )
 
     def _check_views(self) -> None:
         """Raise ConfigError where views do not match the files or masks, or are given twice."""

@@ -81,29 +81,20 @@ def make_folder(folder: Path) -> Path:
 
 
 def digest(path: FilePath) -> bytes:
-    """Return the SHA-256 of a regular file.
+    """Return the SHA-256 of a regular file, computed once while size and time of change stay the same.
 
     InputError if it cannot be read, or has more than :data:`MOST_BYTES`: it is no input of a run.
     """
     try:
-        with opened(path) as file:
-            size = os.fstat(file.fileno()).st_size
-            if size > MOST_BYTES:
-                raise InputError(f"{path}: {size} bytes, expected at most {MOST_BYTES}")
-            return hashlib.file_digest(file, "sha256").digest()
+        about = os.stat(path)
+        return _digest(os.fspath(path), about.st_size, about.st_mtime_ns, about.st_ino)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None
-
-
-def known_digest(path: FilePath) -> bytes:
-    """Return :func:`digest`, computed once while size and time of the last change stay the same."""
-    try:
-        status = os.stat(path)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
-    return _digest(os.fspath(path), status.st_size, status.st_mtime_ns)
 
 
 @functools.lru_cache(maxsize=4096)
-def _digest(path, size, changed):
-    return digest(path)
+def _digest(path, size, changed, inode):
+    if size > MOST_BYTES:
+        raise InputError(f"{path}: {size} bytes, expected at most {MOST_BYTES}")
+    with opened(path) as file:
+        return hashlib.file_digest(file, "sha256").digest()

@@ -162,4 +162,4 @@ def _scene_digests(scene, base):
 
 
 def _digest(path):
-    return f"sha256:{atomic_files.known_digest(path).hex()}"
+    return f"sha256:{atomic_files.digest(path).hex()}"

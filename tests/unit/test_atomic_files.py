@@ -1,5 +1,6 @@
 """Files are written whole or not at all, and libraries are kept quiet."""
 
+import hashlib
 import os
 import sys
 
@@ -45,6 +46,16 @@ def test_a_failure_keeps_the_old_file(tmp_path, raised, seen, says):
 def test_a_block_that_writes_nothing_is_told(tmp_path):
     with pytest.raises(InputError, match="No such file"), atomic_files.replacing(tmp_path / "a"):
         pass
+
+
+def test_a_digest_follows_the_content(tmp_path):
+    path = tmp_path / "a"
+    for data in (b"old", b"newer"):
+        path.write_bytes(data)
+        assert atomic_files.digest(path) == hashlib.sha256(data).digest()
+    path.unlink()
+    with pytest.raises(InputError, match="a: cannot be read"):
+        atomic_files.digest(path)
 
 
 @pytest.mark.parametrize("name", ["gone/a", "file/a", "a\0b", "folder"])

@@ -148,5 +148,5 @@ def _digests(files):
     for file in files:
         digests[file] = ""
         with contextlib.suppress(InputError):
-            digests[file] = atomic_files.known_digest(file).hex()
+            digests[file] = atomic_files.digest(file).hex()
     return digests

@@ -26,9 +26,10 @@ DEEPEST = 20
 time doubles with every ``twosided`` inside another, to 0.3 s at 20."""
 MOST_CHARACTERS = 2**26
 """Of a scene with all that it includes. Beside these an element counts as 64 characters, a file, as often as
-it is included, and a parameter as 65,536, and a character of a value with ``$names`` filled in as 16."""
+it is included, a parameter and a folder as 65,536, and a character of a value with ``$names`` filled in as
+16."""
 _ELEMENT = 2**6
-_FILE = _PARAMETER = 2**16
+_FILE = _PARAMETER = _FOLDER = 2**16
 _FILLED = 2**4
 _INCLUDES_DEEP = 15  # Mitsuba's own bound
 
@@ -90,6 +91,8 @@ class _Reader:
                 if token["closing"]:
                     depth -= 1
                 elif token["tag"]:
+                    if "\ufffd" in token["attributes"]:
+                        raise _WrongError("a tag is not in UTF-8; save the file as UTF-8")
                     self._spend(_ELEMENT)
                     depth += not token["attributes"].endswith("/")
                     if depth > DEEPEST:
@@ -123,6 +126,7 @@ class _Reader:
             self.outline.defaults.add(values["name"])
             self.parameters.setdefault(values["name"], values.get("value", ""))
         elif tag == "path" and "value" in values:
+            self._spend(_FOLDER)
             folder = _resolved(values["value"], folders)
             self.outline.folders.append(Path(folder))
             folders.insert(0, folder)

@@ -115,6 +115,16 @@ def test_sizes_are_bounded(tmp_path, monkeypatch):
     monkeypatch.setattr(scene_text, "MOST_CHARACTERS", 2**18)  # for short tests
     refused(write_scene(tmp_path, *["<integer/>"] * 5_000), "more than")
     refused(write_scene(tmp_path, *[f'<default name="a{i}" value=""/>' for i in range(4)]), "more than")
+    refused(write_scene(tmp_path, *['<path value="."/>'] * 4), "more than")
+
+
+def test_other_letters_than_utf_8_are_refused_in_tags_alone(tmp_path):
+    path = write_scene(tmp_path, SENSOR, LIGHT, "<!-- by Mu -->", BALL)
+    latin = path.read_bytes().replace(b"Mu", b"M\xfc")
+    path.write_bytes(latin)
+    scene_text.read(path, {})
+    path.write_bytes(latin.replace(b'"sphere"', b'"sph\xe8re"'))
+    refused(path, r"line \d+: a tag is not in UTF-8")
 
 
 def test_what_mitsuba_reads_is_read_alike(tmp_path):

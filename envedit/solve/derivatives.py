@@ -1,4 +1,4 @@
-"""Derivatives of a rendering by the unknowns of an edit, at a point.
+"""Derivatives of a rendering, and of the map, by the unknowns of an edit, at a point.
 
 What the map does is asked of the layers: by the gain in forward mode (:meth:`.Layers.gain_slope`), by the
 saturation, and by place and size of a light as differences. What that does to the rendering goes through the
@@ -29,13 +29,23 @@ SIZE_STEP = 0.1
 
 @dataclass(frozen=True)
 class Linearisation:
-    """Derivatives of a rendering."""
+    """Derivatives of a rendering and of the map."""
 
     # (k, h, w, 3), by the unknowns of lights, by a camera's factors, and by the saturation
     pictures: np.ndarray
     named: list  # (str, int, int or ndarray), which these are: name, light, and channel or axis
     profile: np.ndarray  # (h, w, 3), of the sky's light within blocks
     jacobian: list[np.ndarray]  # (blocks, nodes), by the log gain, per channel
+    # Of each light (4, rows, W, 3), of the map: by log flux, each channel by its own, two angles and log size
+    maps: list[np.ndarray]
+
+    def by_lights(self, weights: np.ndarray) -> list[float]:
+        """Return the derivatives of the sum of weights (rows, W, 3) times the map by lights, as ``named``."""
+        values = []
+        for change in self.maps:
+            by_flux, *others = np.einsum("khwc,hwc->kc", change, weights, dtype=np.float64)
+            values += [*(one.sum() for one in others), *by_flux]
+        return values
 
 
 class Derivatives:
@@ -55,9 +65,9 @@ class Derivatives:
     def at(self, point: Point) -> Linearisation:
         """Return the derivatives at a point, which must be finite; they depend on no target and no weight."""
         if self._last is None or self._last[0] is not point.rendering or self._last[1] != self.angle:
-            pictures, named, profile = self._lights(point)
+            pictures, named, profile, maps = self._lights(point)
             jacobian = self.blocks.jacobian(self._slopes(point))
-            made = Linearisation(pictures, named, profile, jacobian)
+            made = Linearisation(pictures, named, profile, jacobian, maps)
             self._last = point.rendering, self.angle, made
         return self._last[2]
 
@@ -79,7 +89,7 @@ class Derivatives:
         return self.blocks.profile(np.maximum(sky, 0))
 
     def _lights(self, point):
-        """Return derivatives by lights and saturation, what these are, and the profile."""
+        """Return derivatives by lights and saturation, what these are, the profile, and those of the map."""
         # ---- Cores through T: rendered, and by two angles and by size
         state, layers = point.state, self.layers
         lights: list = []
@@ -119,6 +129,7 @@ class Derivatives:
             change = self._with_lit_ground(point, cores[:3], change)
             if change is not None:
                 pictures[:3] += self.blocks.pictures(change) * profile.reshape(-1, 3)
+                cores[:3] += change
 
         # ---- A camera's factor of every channel, and the saturation, through the blocks
         of_sky = []
@@ -129,7 +140,7 @@ class Derivatives:
             names.append(("saturation", 0, 0))
             of_sky.append(self._by_saturation(point, profile))
         pictures = self._apart([pictures for *_, pictures in lights], of_sky, point.transport.shape)
-        return pictures, names, profile
+        return pictures, names, profile, [cores for _, _, cores, _ in lights]
 
     def _by_saturation(self, point, profile):
         """Return the derivative of the rendering by the log saturation, (h * w, 3), through the blocks."""

@@ -177,17 +177,23 @@ def descended(
     point: Point,
     steps: int = 1,
     after_step: Callable[[Run, Point], None] | None = None,
+    hopeless: Callable[[Point, float], bool] | None = None,
+    largest_noise: float | None = None,
 ) -> Point:
     """Make at most some ``steps`` from where a run is, at ``point``, and return where they end.
 
-    The run goes along; it may be finished before. Other parameters are those of :func:`solve`.
+    The run goes along; it may be finished before. ``hopeless`` is asked before each step whether to end at a
+    point, and told by how much F falls at most in the steps that are left, if in none by more than this one
+    promises. ``largest_noise`` is that of paint, by default that down to which it is followed. Other
+    parameters are those of :func:`solve`.
     """
+    largest_noise = largest_noise or problem.likelihood.followed_noise
     most = len(run.history) + steps
     while len(run.history) < most and not run.finished:
         began = time.perf_counter()
 
         # ---- Huber's threshold: the noise, at most halved at once
-        noise = problem.likelihood.noise(point.residual)
+        noise = problem.likelihood.noise(point.residual, largest_noise)
         halved = run.scale / 2 if np.isfinite(run.scale) else 0
         run.scale = min(run.scale, max(noise, halved))
 
@@ -196,13 +202,17 @@ def descended(
         normal = problem.normal(point, run.start, run.scale)
         problem.derivatives.angle = NARROW_ANGLE
 
-        # ---- A step that lowers F
-        point, before, better = _lower(problem, run, point, normal)
+        # ---- A step that lowers F, where one may by enough
+        before, better, promised = problem.loss(point, run.start, run.scale), None, normal.decrement
+        if hopeless and hopeless(point, (most - len(run.history)) * promised):
+            break
+        if promised >= LEAST_DECREASE * before:
+            point, before, better = _lower(problem, run, point, normal)
         loss = before if better is None else better.loss
 
         # ---- Whether it is the last one
         little = better is None or before - loss < LEAST_DECREASE * before
-        ended = little and run.scale <= 1.01 * problem.likelihood.noise(point.residual)
+        ended = little and run.scale <= 1.01 * problem.likelihood.noise(point.residual, largest_noise)
         run.finished = ended and (run.wide or not problem.shining(run.state))
         if ended and not run.wide:  # other derivatives: what damping those needed says nothing of them
             run.wide, run.damping = True, Run.damping
@@ -255,7 +265,7 @@ def _lower(problem, run, point, normal):
         there = None if state is None else problem.evaluate(state, point.transport)
         if there is not None and there.residual is not None:
             misfit = problem.likelihood.misfit(there.residual, run.scale)
-            trial = _Trial(there, misfit, problem.penalty(there.state, run.start))
+            trial = _Trial(there, misfit, problem.penalty(there, run.start))
             if trial.loss >= before:
                 again = problem.evaluate(run.state, there.transport, resolve=False)
                 if again.residual is not None:

@@ -79,7 +79,8 @@ class LayersSolver:
                 after_step,
                 most=edit.settings.optimizer.iterations if edit.newton else search.EXPLANATION_STEPS,
             )
-        self.others = () if edit.rendered else explanation.others
+        others = () if edit.rendered else explanation.others
+        self.others = tuple(search.descended(problem, one) for one in others)
         return explanation
 
     def map_of(self, explanation: search.Explanation) -> np.ndarray:
@@ -253,7 +254,7 @@ class LayersSolver:
             seen = edit.target.photo.exposed_by(one.state["camera"][0])
             likelihood = replace(problem.likelihood, least_noise=SIGMA)
             unlikeliness = likelihood.at_best(seen.missed(point.rendering))
-            tried.append((unlikeliness + problem.penalty(one.state, one.start), seen, one))
+            tried.append((unlikeliness + problem.penalty(point, one.start), seen, one))
         if not tried:  # no curve gives a finite rendering
             edit.target = before
             return None

@@ -37,9 +37,10 @@ INDEPENDENT = 256
 """Residuals of a rendering that count as independent, per channel: neighbouring pixels err together."""
 STATEMENTS = 3.0
 """Independent values, per channel, that all paint together states."""
-PAINT_NOISE = 0.3
-"""Largest standard error of paint, as a share of the change that it asks for: no map makes all of what is
-painted (``docs/decisions/experiment_painted_likelihood.md`` has what other values do)."""
+PAINT_NOISE, FOLLOWED = 0.3, 0.2
+"""Largest standard errors of paint, as shares of the change that it asks for, as no map makes all of what is
+painted: by which explanations of it are compared, and down to which the likeliest follows it
+(``docs/decisions/experiment_painted_likelihood.md`` has what other values do)."""
 VISIBLE = 0.02
 """Mean change of display values from which on a change of what was not painted counts as visible."""
 
@@ -52,7 +53,8 @@ class Likelihood:
     weight: np.ndarray
     independent: float = INDEPENDENT  # independent values of a channel among the pixels
     least_noise: float = SIGMA  # standard error that display values have at least
-    paint_noise: float | None = None  # largest standard error of paint, of display values; None: a rendering
+    # Largest standard error of paint by which explanations are compared, of display values; None: a rendering
+    paint_noise: float | None = None
     # (h, w, 1), how much each pixel is of the rest, in [0, 1], whose mean is to stay; None: there is none
     rest: np.ndarray | None = None
     # Radiance from which on all was shown white, where nobody saw differences (``display_curve.py``)
@@ -107,9 +109,22 @@ class Likelihood:
         return np.inf if self.paint_noise is None else max(self.least_noise, self.paint_noise)
 
     @property
+    def followed_noise(self) -> float:
+        """The same towards which the likeliest explanation is followed."""
+        least = self.least_noise
+        return np.inf if self.paint_noise is None else max(least, FOLLOWED / PAINT_NOISE * self.paint_noise)
+
+    @property
     def area(self) -> float:
         """Pixels whose errors go together, A; at least one."""
         return max(1.0, self.weight.size / self.independent)
+
+    @property
+    def unpainted(self) -> float:
+        """Share of the pixels that count that were not painted; 0 of a rendering."""
+        if self.rest is None:
+            return 0.0
+        return float(self.rest.sum(dtype=np.float64)) / np.count_nonzero(self.weight)
 
     @property
     def share(self) -> np.ndarray:
@@ -117,8 +132,7 @@ class Likelihood:
         if self.rest is None:
             return np.zeros_like(self.weight)
         total = self.rest.sum(dtype=np.float64)
-        counted = np.count_nonzero(self.weight)
-        return (np.sqrt(total / counted) / (VISIBLE * total) * self.rest).astype(np.float32)
+        return (np.sqrt(self.unpainted) / (VISIBLE * total) * self.rest).astype(np.float32)
 
     def mean(self, residual: np.ndarray) -> np.ndarray:
         """Return what q is the size of, of a residual (h, w, 3): (3,)."""
@@ -146,18 +160,19 @@ class Likelihood:
             weight = weight * np.minimum(1, sigma / np.maximum(sizes(residual), 1e-12))
         return weight
 
-    def noise(self, residual: np.ndarray) -> float:
+    def noise(self, residual: np.ndarray, largest: float | None = None) -> float:
         """Return the standard error under which the first part is what independent values of it have, 3 n.
 
         The most likely one: for squares exactly, with Huber's loss as an M-estimate of scale (not his
-        proposal 2). At least :attr:`least_noise`, of paint at most :attr:`paint_noise`.
+        proposal 2). At least :attr:`least_noise`, of paint at most ``largest``, by default
+        :attr:`largest_noise`.
         """
         least = self.least_noise
         ratio = self._pixels(residual, least) / (3 * self.independent)
         if ratio <= 1:
             return least
         if not self.robust:
-            return float(min(np.sqrt(ratio) * least, self.largest_noise))
+            return float(min(np.sqrt(ratio) * least, self.largest_noise if largest is None else largest))
         # With the n smallest r within sigma, a their sum of w r^2, and b, c those of w r and w of the others,
         # (a + 2 b sigma - c sigma^2) / (d sigma^2) is to be 1: of the n whose root lies in its range.
         size = sizes(residual)

@@ -4,11 +4,12 @@ Unknowns x: the log gain g of every node, and of every light that is lit its log
 direction (two angles) and its log size. With display values d(.) (``display_curve.py``), T the transport and
 E(x) the map that the layers compose, minimised is
 
-    F(x) = misfit of the residual  +  x' K x
+    F(x) = misfit of the residual  +  x' K x  +  how much more of the sky is white
 
 * The misfit is that of ``likelihood.py``: how unlikely the residual of display values d(T E(x)) - d(t) is.
 * K is the inverse covariance of a sky's change (:class:`Prior`): of the gain along luminance, blue-amber and
   green-magenta; of lights flux, size and direction.
+* White sky counts where the target is painted (``white_sky.py``).
 
 Of a photograph, what is compared with the target is d(exp(c) T E(x)): the log factor c of a channel, exposure
 and white balance, is an unknown too, whose deviation from none the penalty holds. Where the photograph is
@@ -38,6 +39,7 @@ from envedit.solve.likelihood import Likelihood, on_average_one
 from envedit.solve.normal_equations import Normal, solved
 from envedit.solve.prior import AXES, Prior
 from envedit.solve.unknowns import LOG_SATURATIONS, Point, Unknowns, in_numpy
+from envedit.solve.white_sky import WhiteSky
 from envedit.targets.photo import Photo
 from envedit.transport.light_transport import COLUMNS_A_LOOK, LightTransport
 
@@ -142,6 +144,8 @@ class Problem(Unknowns):
         self.picture = picture
         self.likelihood = likelihood or Likelihood(on_average_one(None, picture.shape[:2]))
         self.target = display_curve.values(picture, self.likelihood.white)
+        unpainted = self.likelihood.unpainted
+        self.white_sky = WhiteSky.of(self.envmap, unpainted) if unpainted > 0 else None
 
     def aimed_at(self, picture: np.ndarray, likelihood: Likelihood | None, point: Point) -> Point:
         """Take another target, with its likelihood; returns a point with its residual from that target."""
@@ -193,14 +197,19 @@ class Problem(Unknowns):
 
     def loss(self, point: Point, start: dict, sigma: float) -> float:
         """Return F."""
-        return self.likelihood.misfit(point.residual, sigma) + self.penalty(point.state, start)
+        return self.likelihood.misfit(point.residual, sigma) + self.penalty(point, start)
 
     def unlikeliness(self, point: Point, start: dict) -> float:
         """Return -2 log posterior density at the noise that the residual shows, but for a constant."""
-        return self.likelihood.at_best(point.residual) + self.penalty(point.state, start)
+        return self.likelihood.at_best(point.residual) + self.penalty(point, start)
 
-    def penalty(self, state: dict, start: dict) -> float:
-        """Return x' K x; ``start`` is where the search has put the lights."""
+    def penalty(self, point: Point, start: dict) -> float:
+        """Return what F has beside the misfit; ``start`` is where the search has put the lights."""
+        whitened = 0.0 if self.white_sky is None else self.white_sky.loss(point.edited)
+        return self.from_start(point.state, start) + whitened
+
+    def from_start(self, state: dict, start: dict) -> float:
+        """Return x' K x."""
         total = sum(v @ k @ v for v, k in zip(AXES @ state["gain"].T, self._precisions, strict=True))
         total += (state["saturation"][0, 0] / self.prior.saturation) ** 2
         if self.photo is not None:
@@ -274,8 +283,9 @@ class Problem(Unknowns):
                 hessian[part, rest] = hessian[rest, part].T
                 lights_in_blocks.append(in_blocks)
 
-        # ---- The mean of what was not painted, and the prior
+        # ---- The mean of what was not painted, white sky, and the prior
         hessian += mean_by_unknowns.T @ mean_by_unknowns
+        self._add_white(hessian, gradient, point, linear)
         precision = self._precision(linear.named)
         hessian += precision
         if descent:
@@ -301,12 +311,28 @@ class Problem(Unknowns):
         """Return the normal equations without descent, at the noise that the residual shows."""
         return self.normal(point, start, self.likelihood.noise(point.residual), descent=False)
 
+    def _add_white(self, hessian, gradient, point, linear):
+        """Add what white sky is to the normal equations."""
+        if self.white_sky is None:
+            return
+        slope, white = self.white_sky.linear(point.edited)
+        if white > 0:
+            slope = slope[self.rows]
+            by_nodes, by_saturation = self._by_sky(point, slope)
+            others = [0.0] * 3 * self.photographed + [by_saturation] * self.saturates
+            by_unknowns = np.concatenate([by_nodes.T.ravel(), linear.by_lights(slope), others])
+            hessian += np.outer(by_unknowns, by_unknowns)
+            gradient += white * by_unknowns
+
     def _pulled_back(self, point, picture):
-        """Return the derivatives of the sum of a picture times T E.
+        """Return what :meth:`_by_sky` does of the sum of a picture times T E."""
+        return self._by_sky(point, point.transport.adjoint(np.float32(picture)).numpy()[self.rows])
+
+    def _by_sky(self, point, light):
+        """Return the derivatives of the sum of the active rows times ``light``, of the same shape.
 
         By every node's log gain, (n, 3), and by the log saturation; 0 where that is no unknown.
         """
-        light = point.transport.adjoint(np.float32(picture)).numpy()[self.rows]
         params = self.params(point.state)
         names = self.grids + ["saturation"] * self.saturates
         with dr.isolate_grad():

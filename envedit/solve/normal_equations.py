@@ -45,6 +45,15 @@ class Normal:
             return float(len(self.hessian))
         return float(len(self.hessian) - np.trace(shares))
 
+    @property
+    def decrement(self) -> float:
+        """By how much a step lowers F at most, were F quadratic: q' H^-1 q; inf where there is no step."""
+        try:
+            step = solved(np.linalg.cholesky(self.hessian), self.gradient)
+        except np.linalg.LinAlgError:
+            return np.inf
+        return float(self.gradient @ step)
+
 
 def forward(lower: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Solve L x = values, (n,) or (n, k), by substitution, :data:`ROWS` at a time; L is lower triangular."""

@@ -97,7 +97,7 @@ def search(
     and then; what it raises ends the search.
     """
     steps = min(most, EXPLANATION_STEPS)
-    best = _descended(problem, {}, gauss_newton.Run(start, start), problem.transport, steps)
+    best = _descended(problem, {}, gauss_newton.Run(start, start), problem.transport, steps, np.inf)
     cleared = {name: np.zeros_like(start[name]) for name in ("gain", "saturation")}
     compared: list[Explanation] = [best]
     better = best if best.point.residual is not None else None
@@ -125,6 +125,13 @@ def further(
     return _likelier(best, _neighbours(problem, best, promising, after_step, EXPLANATION_STEPS, {}))
 
 
+def descended(problem: Problem, explanation: Explanation) -> Explanation:
+    """Return an explanation whose steps may have been ended as another was likelier, some steps on."""
+    run = explanation.run.onward()
+    point = gauss_newton.descended(problem, run, explanation.point, EXPLANATION_STEPS)
+    return replace(explanation, run=run, point=point, score=score(problem, run, point))
+
+
 def _likelier(best, explanations):
     """Return the likeliest of some explanations if it is likelier than the best so far, else None."""
     likeliest = min([best, *explanations], key=lambda one: one.score)
@@ -150,12 +157,14 @@ def _unfollowed(problem, best):
 
 def _neighbours(problem, best, moves, after_step, steps, sky):
     """List the explanations one of some moves from another, begun under a sky."""
-    neighbours = []
+    neighbours: list[Explanation] = []
+    likeliest = best.score
     for move in moves:
         history = list(best.run.history) if not sky else []
         run = gauss_newton.Run(move.state | sky, move.centre, history=history)
         done = move.after(best.done, problem.layers.lights.own)
-        neighbours.append(_descended(problem, done, run, best.point.transport, steps))
+        neighbours.append(_descended(problem, done, run, best.point.transport, steps, likeliest))
+        likeliest = min(likeliest, neighbours[-1].score)
         if after_step:
             after_step()
     return neighbours
@@ -213,11 +222,26 @@ def _faded(problem, state):
     return [k for k in problem.shining(state) if k < own and state["flux"][k].mean() < FADED_LOG_FLUX]
 
 
-def _descended(problem, done, run, transport, steps):
-    """Return the explanation that a few steps from where a run is lead to, first through ``transport``."""
+def _descended(problem, done, run, transport, steps, likeliest):
+    """Return the explanation that a few steps from where a run is lead to, first through ``transport``.
+
+    Of paint, steps end where they promise no explanation with a lower score than the ``likeliest``.
+    """
+
+    def hopeless(point, promised):
+        return score(problem, run, point) - promised > likeliest
+
     point = problem.evaluate(run.state, transport)
     if point.residual is not None:
-        point = gauss_newton.descended(problem, run, point, steps)
+        point = gauss_newton.descended(
+            problem,
+            run,
+            point,
+            steps,
+            hopeless=None if problem.likelihood.robust else hopeless,
+            largest_noise=problem.likelihood.largest_noise,
+        )
+        run.finished &= problem.likelihood.robust  # paint is followed further
     return Explanation(done, run, point, score(problem, run, point))
 
 

@@ -5,9 +5,10 @@ import numpy as np
 import pytest
 
 from envedit.core import latlong
+from envedit.losses.naturalness import white
 from envedit.representations.layers.layers import Layers
 from envedit.scene import scene
-from envedit.solve import search
+from envedit.solve import gauss_newton, search
 from envedit.solve.gauss_newton import Run
 from envedit.solve.likelihood import VISIBLE, Likelihood
 from envedit.solve.map_problem import Problem
@@ -208,6 +209,12 @@ def test_of_paint_that_no_light_makes_other_answers_are_shown(transport, rng):
     problem, start = problem_of(transport, image, before * stripes[:, None, None], coverage)
     found, _, _, tried = found_for(problem, start)
     assert found.others and tried >= len(found.others)
+    # What could not become likelier was given up; its steps can go on.
+    given_up = [one for one in found.others if len(one.run.history) < search.EXPLANATION_STEPS]
+    assert given_up
+    for one in given_up:
+        further = search.descended(problem, one)
+        assert further.score < one.score and len(further.run.history) > len(one.run.history)
 
 
 def test_paint_that_is_there_already_leaves_lights(transport):
@@ -246,6 +253,28 @@ def test_paint_that_grades_all_of_the_picture_leaves_lights_and_changes_their_co
     assert found.name == "lights left where they are" and angle(lights[0], DIRECTIONS[SUN]) < 3
     log_flux = found.run.state["flux"][0]
     assert log_flux[2] - log_flux[0] == pytest.approx(np.log(grade[2] / grade[0]), rel=0.3)
+
+
+@pytest.mark.parametrize("painted", ["part", "all"])
+def test_a_sky_does_not_turn_white_for_paint_on_a_part_of_the_picture(transport, painted):
+    """Brighter where the picture is in the shade. A brighter picture as a whole has a brighter sky."""
+    image = sky(flux=0) * np.float32(1.6)
+    before = rendered(transport, image)
+    coverage = np.ones((PIXELS, PIXELS, 1), np.float32)
+    if painted == "part":
+        coverage[:24], coverage[:, :12], coverage[:, 36:] = 0, 0, 0
+    problem, start = problem_of(transport, image, before * (1 + 0.7 * coverage), coverage, of_paint(1.0))
+
+    def whiter():
+        run = Run(start, start)
+        point = gauss_newton.descended(problem, run, problem.evaluate(start), 8)
+        return white(point.edited) - white(image)
+
+    held = whiter()
+    problem.white_sky = None
+    free = whiter()
+    assert free > 0.2
+    assert held < 0.02 if painted == "part" else held == free
 
 
 def test_a_map_that_is_not_finite_has_no_explanation(transport):

@@ -22,6 +22,7 @@ from envedit.solve.gauss_newton import Run, solve
 from envedit.solve.likelihood import Likelihood, on_average_one
 from envedit.solve.map_problem import Problem
 from envedit.solve.prior import Prior, of_paint
+from envedit.solve.white_sky import WhiteSky
 from envedit.targets.pixel_weights import pixel_weight
 from tests.oracles.dense_transport import DenseTransport
 from tests.oracles.maps import angle
@@ -97,7 +98,9 @@ def painted():
     coverage[2:7, 3:9] = 1
     weight = pixel_weight(coverage, np.zeros(FILM, bool), 1.0, 0.3)
     initial = np.full((*FILM, 3), 0.2, np.float32)
-    return moved_case(lambda _: Likelihood.of_paint(weight, coverage, initial, initial + 0.3 * coverage))
+    case = moved_case(lambda _: Likelihood.of_paint(weight, coverage, initial, initial + 0.3 * coverage))
+    case[0].white_sky = None  # of its own in another test
+    return case
 
 
 @pytest.fixture(scope="module")
@@ -143,8 +146,10 @@ CLOSE = {"gain": 2e-3, "flux": 2e-3, "turn": 0.05, "size": 0.2, "camera": 2e-3}
 
 def total(problem, state, start=None, sigma=1.0):
     """F of a state, or its misfit alone without a start."""
-    penalty = 0.0 if start is None else problem.penalty(state, start)
-    return problem.likelihood.misfit(problem.evaluate(state).residual, sigma) + penalty
+    point = problem.evaluate(state)
+    if start is None:
+        return problem.likelihood.misfit(point.residual, sigma)
+    return problem.loss(point, start, sigma)
 
 
 def differences(problem, state, unknowns, some, h, f):
@@ -360,13 +365,55 @@ def test_penalty_is_that_of_the_precision(case, prior, rng):
     problem = of_prior(case, prior)
     normal = problem.normal(problem.evaluate(state), start, 1.0)
     x = problem._from_prior(state, start, normal.linear.named)
-    assert problem.penalty(state, start) == pytest.approx(x @ normal.precision @ x, rel=1e-9)
+    assert problem.from_start(state, start) == pytest.approx(x @ normal.precision @ x, rel=1e-9)
     pull, some = normal.precision @ x, rng.choice(3 * problem.nodes, 5, replace=False)
-    found = slopes(problem, state, normal.linear.named, some, 1e-4, lambda end: problem.penalty(end, start))
+    found = slopes(
+        problem, state, normal.linear.named, some, 1e-4, lambda end: problem.from_start(end, start)
+    )
     np.testing.assert_allclose(pull[some], found, rtol=1e-4)
     spare = copy(start)
     spare["flux"][1], spare["turn"][1], spare["size"][1] = DARK + 0.3, 0.1, 0.2
-    assert problem.penalty(start, start) == problem.penalty(spare, start) == 0
+    assert problem.from_start(start, start) == problem.from_start(spare, start) == 0
+
+
+def test_white_sky_counts_where_more_is_white(case):
+    """Its gradient is that of finite differences; nothing where less is white, and at no edit."""
+    _, _, start, state = case
+    problem = of_prior(case, of_paint(0.5))
+    problem.white_sky = white_sky = WhiteSky.of(problem.envmap, 0.8)
+    whiter = state | {"gain": state["gain"] + 0.3}
+    point = problem.evaluate(whiter)
+    normal = problem.normal(point, start, 1.0)
+    assert white_sky.loss(point.edited) > 10
+    problem.white_sky = None
+    gradient = normal.gradient - problem.normal(point, start, 1.0).gradient
+    some = range(0, 3 * problem.nodes, 4)
+    found = slopes(
+        problem, whiter, normal.linear.named, some, 0.003, lambda end: white_sky.loss(edited(problem, end))
+    )
+    np.testing.assert_allclose(gradient[some], found, rtol=0, atol=1e-2 * np.abs(found).max())
+    assert white_sky.loss(edited(problem, start)) == 0
+    assert WhiteSky.of(problem.envmap, 0.0).loss(point.edited) == 0
+    assert white_sky.loss(edited(problem, start | {"gain": start["gain"] - 1})) == 0
+
+
+def test_derivatives_of_the_map_by_lights(case, rng):
+    problem, _, _, state = case
+    linear = problem.derivatives.at(problem.evaluate(state))
+    weights = rng.random((*GRID, 3))[problem.rows]
+    for k, (derivative, (name, _, _)) in enumerate(
+        zip(linear.by_lights(weights), linear.named, strict=True), 3 * problem.nodes
+    ):
+
+        def f(end):
+            return float((weights * np.float64(edited(problem, end)[problem.rows])).sum())
+
+        (found,) = 2 * slopes(problem, state, linear.named, [k], STEPS[name], f)
+        assert derivative == pytest.approx(found, rel=CLOSE[name], abs=0.05 if name == "turn" else 0), name
+
+
+def edited(problem, state):
+    return problem.evaluate(state).edited
 
 
 # ---- a problem of known solution ---------------------------------------------------------------------------
@@ -413,6 +460,14 @@ def test_linear_problem_has_its_closed_solution(rng, monkeypatch):
     assert (got - expected) @ hessian @ (got - expected) < 1e-4 * least
     assert np.linalg.norm(got - expected) < 0.04 * np.linalg.norm(expected)
     assert solution.run.history[-1]["loss"] == pytest.approx(least, rel=2e-3)
+    # What the first step promises is that, and the last one nothing.
+    start = problem.state(params)
+    first, last = (
+        problem.normal(point, start, sigma)
+        for point in (problem.evaluate(start), gauss_newton.reached(problem, solution.run))
+    )
+    assert first.decrement == pytest.approx((residual**2).sum() / sigma**2 - least, rel=5e-3)
+    assert last.decrement < 1e-3 * first.decrement
     # As noise would let steps do: what is asked for is noise.
     kept = solve(problem, params, iterations=60)
     assert kept.note and not problem.state(kept.params)["gain"].any()
@@ -464,10 +519,7 @@ def followed(problem, params, **options):
     before, scale = problem.evaluate(start), np.inf
     sigma = problem.likelihood.least_noise
     for row, point in zip(solution.run.history, points, strict=False):
-        f, earlier = (
-            problem.likelihood.misfit(one.residual, row["sigma"]) + problem.penalty(one.state, start)
-            for one in (point, before)
-        )
+        f, earlier = (problem.loss(one, start, row["sigma"]) for one in (point, before))
         assert f == pytest.approx(row["loss"], rel=1e-9) == row["data"] + row["prior"]
         assert f < earlier
         assert sigma <= row["sigma"] <= max(scale, sigma)
@@ -806,8 +858,10 @@ def test_the_glow_is_in_the_derivative_by_a_lights_flux_and_place(added, rng):
         state["flux"][1] = [-0.4, -0.7, -0.2]
     point = problem.evaluate(state)
     normal, n = problem.normal(point, start, 1.0), problem.nodes
-    pictures, named, _ = problem.derivatives._lights(point)
-    for k, (name, _, _) in enumerate(named):
+    linear = problem.derivatives.at(point)
+    weights = rng.random((*GRID, 3))[problem.rows]
+    by_lights = linear.by_lights(weights)
+    for k, (name, _, _) in enumerate(linear.named):
         if name == "size":
             continue
         h = STEPS[name]
@@ -815,7 +869,9 @@ def test_the_glow_is_in_the_derivative_by_a_lights_flux_and_place(added, rng):
         ends = [problem.evaluate(one) for one in there]
         slope = (ends[0].rendering - ends[1].rendering) / (2 * h)
         # Cells are some texels, and the glow's own peak is narrower.
-        assert np.abs(pictures[k] - slope).max() < 0.15 * np.abs(slope).max(), name
+        assert np.abs(linear.pictures[k] - slope).max() < 0.15 * np.abs(slope).max(), name
+        first, last = ((weights * np.float64(end.edited[problem.rows])).sum() for end in ends)
+        assert by_lights[k] == pytest.approx((first - last) / (2 * h), rel=0.02, abs=0.05), name
 
 
 @pytest.mark.slow

@@ -90,14 +90,16 @@ def search(
     start: dict,
     after_step: Callable[[], None] | None = None,
     most: int = EXPLANATION_STEPS,
+    left: Explanation | None = None,
 ) -> Explanation:
     """Find the likeliest explanation, from ``start``, the state of the map as it is.
 
     ``most`` bounds the Gauss-Newton steps after which explanations are compared. ``after_step`` is called now
-    and then; what it raises ends the search.
+    and then; what it raises ends the search. ``left`` is the explanation that leaves lights where they are,
+    if it is known.
     """
     steps = min(most, EXPLANATION_STEPS)
-    best = _descended(problem, {}, gauss_newton.Run(start, start), problem.transport, steps, np.inf)
+    best = left or _descended(problem, {}, gauss_newton.Run(start, start), problem.transport, steps, np.inf)
     cleared = {name: np.zeros_like(start[name]) for name in ("gain", "saturation")}
     compared: list[Explanation] = [best]
     better = best if best.point.residual is not None else None

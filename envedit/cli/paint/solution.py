@@ -202,10 +202,11 @@ class Solution:
         A light that jumps, or that is added, is where no small step leads. ``unless_newer`` is called now and
         then; what it raises ends the search.
         """
-        now = search.score(self.problem, self.run, self.point)
-        found = search.search(self.problem, self.still, after_step=unless_newer)
+        now = search.Explanation({}, self.run, self.point, search.score(self.problem, self.run, self.point))
+        left = now if self.start is self.still else None
+        found = search.search(self.problem, self.still, after_step=unless_newer, left=left)
         self.searched = True
-        if found.score < now:
+        if found.score < now.score:
             self.run, self.start, self.point = found.run, found.run.start, found.point
         if found.others:
             self.explanations = [replace(found, run=self.run, point=self.point), *found.others]

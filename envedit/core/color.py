@@ -10,6 +10,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from envedit.core.errors import ConfigError
 from envedit.core.types import ArrayLike
 
 LUMINANCE = (0.2126, 0.7152, 0.0722)
@@ -84,10 +85,18 @@ def tonemap(image: ArrayLike, name: str = "gamma") -> np.ndarray:
     - ``reinhard``: ((1 + 1/W) E / (1 + E))^(1/2.2) of clip(E, 0, W), W = 10^4 (Reinhard et al. 2002, Eq. 3,
       scaled so that W is white), so that 1 maps to 0.73
     - ``linear``: clip(E, 0, 1)
+
+    ConfigError if there is no such tonemap.
     """
-    return TONEMAPS[name](np.asarray(image))
+    return _named(TONEMAPS, name)(np.asarray(image))
 
 
 def inverse_tonemap(image: ArrayLike, name: str = "gamma") -> np.ndarray:
     """Map display values back to linear radiance; what :func:`tonemap` has cut does not come back."""
-    return INVERSE_TONEMAPS[name](np.asarray(image))
+    return _named(INVERSE_TONEMAPS, name)(np.asarray(image))
+
+
+def _named(table, name):
+    if name not in table:
+        raise ConfigError(f"unknown tonemap '{name}'; use one of {', '.join(table)}")
+    return table[name]

@@ -182,10 +182,10 @@ def descended(
 ) -> Point:
     """Make at most some ``steps`` from where a run is, at ``point``, and return where they end.
 
-    The run goes along; it may be finished before. ``hopeless`` is asked before each step whether to end at a
-    point, and told by how much F falls at most in the steps that are left, if in none by more than this one
-    promises. ``largest_noise`` is that of paint, by default that down to which it is followed. Other
-    parameters are those of :func:`solve`.
+    The run goes along; it may be finished before. ``hopeless`` is called before each step, with the point and
+    by how much F falls in the steps that are left if in each by what this one promises; where it returns
+    true, no further step is made. ``largest_noise`` is that of paint, by default that down to which it is
+    followed. Other parameters are those of :func:`solve`.
     """
     largest_noise = largest_noise or problem.likelihood.followed_noise
     most = len(run.history) + steps

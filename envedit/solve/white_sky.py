@@ -5,11 +5,11 @@ that is added, in clouds beside a sun that moves. A photograph with so much more
 photograph. So the share s(E) of the sky's solid angle that is white is one more statement of a painted edit,
 as the mean of what was not painted is (``likelihood.py``), of whose pixels u is the share:
 
-    3 N rho_1(q),    q = sqrt(u) max(0, s(E) - s(E_0)) / KNOWN,
+    3 N rho_1(q),    q = sqrt(u) max(0, s(E) - s(E_0)) / k,
 
-free where less is white, linear where more than KNOWN is, and nothing where all is painted, as a brighter
-picture has a brighter sky. A texel counts by its darkest channel m, as m^k / (1 + m^k): half where it is as
-bright as white.
+free where less is white, linear where more than k is, and nothing where all is painted, as a brighter
+picture has a brighter sky. k is KNOWN, or two texels if they are more: a light is at least one. A texel
+counts by its darkest channel m, as m^p / (1 + m^p): half where it is as bright as white.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from envedit.solve.likelihood import STATEMENTS, huber
 KNOWN = 0.02
 """Share of the sky that may turn white before it counts fully."""
 SHARPNESS = 12
-"""k: texels count by 1 to 99 % where they have 0.68 to 1.5 times the radiance of white."""
+"""p: texels count by 1 to 99 % where they have 0.68 to 1.5 times the radiance of white."""
 LIMIT = 100.0
 """Radiance beyond which a texel is white and no more."""
 
@@ -33,21 +33,22 @@ LIMIT = 100.0
 class WhiteSky:
     """The statement of one original map.
 
-    ``share`` is s(E_0), ``unpainted`` u; ``solid_angle`` (rows, 1) that of a texel of the upper half, of
-    which it is 1.
+    ``share`` is s(E_0), ``per_share`` sqrt(u) / k; ``solid_angle`` (rows, 1) that of a texel of the upper
+    half, of which it is 1.
     """
 
     solid_angle: np.ndarray
     share: float
-    unpainted: float
+    per_share: float
 
     @classmethod
     def of(cls, envmap: np.ndarray, unpainted: float) -> WhiteSky:
-        """Return that of an original (H, W, 3)."""
+        """Return that of an original (H, W, 3), where a share of the picture was not painted."""
         height, width, _ = envmap.shape
         solid_angle = latlong.solid_angles(height, width)[: max(1, height // 2), None]
         solid_angle = solid_angle / (width * solid_angle.sum())
-        return cls(solid_angle, _share(envmap, solid_angle), unpainted)
+        known = max(KNOWN, 2 * float(solid_angle.max()))
+        return cls(solid_angle, _share(envmap, solid_angle), np.sqrt(unpainted) / known)
 
     def loss(self, edited: np.ndarray) -> float:
         """Return the formula above for an edited map (H, W, 3)."""
@@ -57,7 +58,6 @@ class WhiteSky:
         """Return a slope by texels (H, W, 3), and a value whose square has the gradient of :meth:`loss`."""
         size = self._size(edited)
         scale = np.sqrt(3 * STATEMENTS / max(1.0, size))
-        per_share = np.sqrt(self.unpainted) / KNOWN
         slope = np.zeros(edited.shape, np.float32)
         if size > 0:
             sky = edited[: len(self.solid_angle)]
@@ -65,14 +65,13 @@ class WhiteSky:
             radiance = np.clip(np.take_along_axis(sky, darkest, axis=2).astype(np.float64), 1 / LIMIT, LIMIT)
             white = radiance**SHARPNESS
             by_radiance = SHARPNESS * white / (radiance * (1 + white) ** 2)
-            change = scale * per_share * self.solid_angle[..., None] * by_radiance
+            change = scale * self.per_share * self.solid_angle[..., None] * by_radiance
             np.put_along_axis(slope[: len(sky)], darkest, change, axis=2)
         return slope, scale * size
 
     def _size(self, edited):
         """Return q."""
-        more = max(0.0, _share(edited, self.solid_angle) - self.share)
-        return float(np.sqrt(self.unpainted)) * more / KNOWN
+        return self.per_share * max(0.0, _share(edited, self.solid_angle) - self.share)
 
 
 def _share(envmap, solid_angle):

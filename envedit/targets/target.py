@@ -160,7 +160,6 @@ def _of_paint(settings, scene, envmap, picture, mask, hidden):
     # ---- The picture
     chosen = settings.target
     initial = initial_rendering.initial(scene, envmap, settings)
-    asked = _asked(chosen, picture, mask)
     if picture is not None:
         painted = painted_image.given(picture, (scene.height, scene.width), initial, mask)
         source = "painted: given as an array"
@@ -181,6 +180,7 @@ def _of_paint(settings, scene, envmap, picture, mask, hidden):
 
         if rendered_anew.is_rendered_anew(painted.picture, initial, painted.coverage, again, scene.rows):
             return _of_rendering(settings, scene, envmap, picture, mask, FOUND_ANEW)
+    asked = _asked(chosen, picture, mask)
     picture, warnings = painted.picture, painted.warnings
     if over := int((picture > BRIGHTEST).any(axis=2).sum()):
         # Squares and sums of what is more would leave single precision; on a display it is as white.
@@ -213,7 +213,6 @@ def _of_rendering(settings, scene, envmap, picture, mask, how=""):
     """Take a picture of the scene under other light; ``how``: why it is taken for one."""
     # ---- The picture
     chosen, shape = settings.target, (scene.height, scene.width)
-    asked = _asked(chosen, picture, mask)
     if picture is not None:
         everywhere = np.ones(shape) if mask is None else mask
         image = painted_image.given(picture, shape, np.zeros((*shape, 3)), everywhere)
@@ -230,6 +229,7 @@ def _of_rendering(settings, scene, envmap, picture, mask, how=""):
         source = f"a picture of the scene: {', '.join(chosen.files)}"
 
     # ---- Pixels that count, and its noise
+    asked = _asked(chosen, picture, mask)
     if not ((image.coverage[..., 0] > 0) & ~image.excluded).any():
         raise InputError("target: no pixel of the picture counts: all are clipped, masked or transparent")
     weight = None if (image.coverage == 1).all() else image.coverage

@@ -80,7 +80,7 @@ class LayersSolver:
                 most=edit.settings.optimizer.iterations if edit.newton else search.EXPLANATION_STEPS,
             )
         others = () if edit.rendered else explanation.others
-        self.others = tuple(search.descended(problem, one) for one in others)
+        self.others = tuple(search.completed(problem, one) for one in others)
         return explanation
 
     def map_of(self, explanation: search.Explanation) -> np.ndarray:

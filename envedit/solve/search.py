@@ -127,7 +127,7 @@ def further(
     return _likelier(best, _neighbours(problem, best, promising, after_step, EXPLANATION_STEPS, {}))
 
 
-def descended(problem: Problem, explanation: Explanation) -> Explanation:
+def completed(problem: Problem, explanation: Explanation) -> Explanation:
     """Return an explanation whose steps may have been ended as another was likelier, some steps on."""
     run = explanation.run.onward()
     point = gauss_newton.descended(problem, run, explanation.point, EXPLANATION_STEPS)

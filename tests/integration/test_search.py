@@ -168,8 +168,10 @@ def test_light_painted_beside_light_that_holds_adds_a_light(transport):
     problem, start = problem_of(transport, image, picture, np.maximum(coverage, held.astype(np.float32)))
     found, lights, before, _ = found_for(problem, start)
     assert found.name == "light added" and [*lights] == [0, problem.layers.lights.own]
-    assert angle(lights[1], DIRECTIONS[place]) < 12 and angle(lights[0], DIRECTIONS[SUN]) < 8
     assert found.score < before - search.POSITIVE_EVIDENCE
+    found = search.completed(problem, found)
+    added, own = (problem.direction(found.run.state, k) for k in (problem.layers.lights.own, 0))
+    assert angle(added, DIRECTIONS[place]) < 8 and angle(own, DIRECTIONS[SUN]) < 8
     off = problem.likelihood.mean(found.point.residual) * VISIBLE
     assert np.abs(off).max() < 2 * VISIBLE
 
@@ -213,7 +215,7 @@ def test_of_paint_that_no_light_makes_other_answers_are_shown(transport, rng):
     given_up = [one for one in found.others if len(one.run.history) < search.EXPLANATION_STEPS]
     assert given_up
     for one in given_up:
-        further = search.descended(problem, one)
+        further = search.completed(problem, one)
         assert further.score < one.score and len(further.run.history) > len(one.run.history)
 
 

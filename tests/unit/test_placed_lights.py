@@ -227,14 +227,15 @@ def test_a_muted_light_is_off_and_keeps_its_flux(sky):
 
 @on_cpu
 @pytest.mark.slow
-@pytest.mark.parametrize(("tilt", "tolerance"), [(0, 3e-3), (12, 5e-3)])
-def test_a_locked_light_is_left_by_the_edit_at_both_resolutions(tilt, tolerance, tmp_path):
-    """Under a target that asks for half the light, all but the locked sun gets darker."""
+@pytest.mark.parametrize("tilt", [0, 12])
+def test_a_locked_light_is_left_by_the_edit_at_both_resolutions(tilt, tmp_path):
+    """Under a target that asks for half the light all but the sun gets darker, also the sky behind it."""
     key = {"light": 1, "name": "key", "locked": True}
     asked = {"rotate_degrees": 90, "tilt_degrees": tilt, "lights": [key]}
     wide, _, result, full = at_both_resolutions(tmp_path, asked, **DARKER)
     rotated = oriented(wide, Orientation(90, tilt))
     for edited, before in ((result.envmap, result.maps["initial"]), (full, rotated)):
         sun = before.mean(axis=2) > 0.5 * before.mean(axis=2).max()
-        assert np.allclose(edited[sun], before[sun], rtol=tolerance), "more than the sky behind the sun"
+        behind = np.quantile(before[~sun], 0.98, axis=0) / 2
+        assert (np.abs(edited - before)[sun] < behind).all(), "more than half the sky behind the sun"
         assert edited[~sun].mean() < 0.9 * before[~sun].mean(), "what is free does not follow"

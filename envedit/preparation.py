@@ -134,8 +134,9 @@ class Preparation:
         with self.clock("start_s"):
             self.watch.stage("comparing the edits of the turned and of the unturned sky")
             score, other = (one.layers.settle() for one in (turned, still))
-        # As many turns as the map has columns could have been the best one.
-        score += 2 * np.log(self.original.shape[1])
+        # The map has as many turns as columns, each of which could have been the best: the mean likelihood
+        # of all counts.
+        score += 2 * np.log(self.original.shape[1] / turn.alike)
         chosen = still if other < score - STRONG_EVIDENCE else turned
         chosen.notes.append(
             f"-2 log evidence (lower is likelier): {score:.5g} with the sky turned, {other:.5g} without"

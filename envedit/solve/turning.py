@@ -15,6 +15,7 @@ import numpy as np
 
 from envedit.core import latlong
 from envedit.losses import display_curve
+from envedit.solve.likelihood import INDEPENDENT, SIGMA
 from envedit.transport.light_transport import LightTransport
 
 TURNS_RENDERED, TURNS_APART_TEXELS = 3, 4
@@ -40,6 +41,7 @@ class Turn:
     still: float
     # The share of the residual of blocks that the turn leaves, beyond what the block transport errs by
     blocks: float = np.inf
+    alike: float = 1.0  # how many turns by whole texels are about as likely: the sum of their likelihoods
 
     @property
     def left(self) -> float:
@@ -70,7 +72,7 @@ def find(
     misfit, least = _at_a_glance(transport, envmap, picture, weight, rendering)
     explains = misfit.min() <= max(EXPLAINED**2 * misfit[0], BLOCK_ERROR_FACTOR**2 * least)
     if not (thorough or explains):
-        return Turn(0.0, known[0.0], known[0.0])
+        return Turn(degrees=0.0, error=known[0.0], still=known[0.0])
     best: list[int] = []
     for shift in np.argsort(misfit, kind="stable"):
         apart_by = [min(abs(shift - other), width - abs(shift - other)) for other in best]
@@ -103,7 +105,19 @@ def find(
     blocks = np.inf
     if least < misfit[0] < np.inf:
         blocks = float(np.sqrt(max(misfit.min() - least, 0) / (misfit[0] - least)))
-    return Turn(360 * texels / width, error(texels), error(0.0), blocks)
+    return Turn(
+        degrees=360 * texels / width,
+        error=error(texels),
+        still=error(0.0),
+        blocks=blocks,
+        alike=_alike(misfit),
+    )
+
+
+def _alike(misfit):
+    """Return the sum of likelihoods over that of the best turn, by misfits (W,) of :func:`_at_a_glance`."""
+    least = misfit.min()
+    return float(np.exp(-1.5 * INDEPENDENT * (misfit - least) / max(least, SIGMA**2)).sum())
 
 
 def _fraction(render, maps, picture, weight):
@@ -145,7 +159,7 @@ def display_values(picture: np.ndarray) -> np.ndarray:
 
 
 def _at_a_glance(transport, envmap, picture, weight, rendering):
-    """Return the squared display residual of blocks under each turn by whole texels, (W,).
+    """Return the mean squared display residual of blocks under each turn by whole texels, (W,).
 
     And that of the map as it is from its own rendering: the error of the block transport.
     """
@@ -172,4 +186,5 @@ def _at_a_glance(transport, envmap, picture, weight, rendering):
         shown = display_curve.values(blocks)
         result += (share * np.square(shown - target[:, c : c + 1])).sum(axis=0)
         least += float((share[:, 0] * np.square(shown[:, 0] - own[:, c])).sum())
-    return np.where(np.isfinite(result), result, np.inf), least
+    values = max(3 * float(share.sum()), 1e-30)
+    return np.where(np.isfinite(result), result / values, np.inf), least / values

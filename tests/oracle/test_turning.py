@@ -60,7 +60,7 @@ def test_a_glance_shows_what_t_does_where_blocks_are_pixels_and_cells_texels(tra
     for k in range(GRID[1]):
         made = rendered(traced, np.roll(image, -k, axis=1))
         made = np.float64(turning.display_curve.to_display(tensor(made)).numpy())
-        plain.append((count * (made - shown) ** 2).sum())
+        plain.append((count * (made - shown) ** 2).sum() / (3 * count.sum()))
     np.testing.assert_allclose(glance, plain, rtol=1e-3)
     assert least < 1e-6 * min(plain)
 
@@ -69,6 +69,13 @@ def test_a_sky_that_is_not_there_under_any_turn(traced, rng):
     image = sky(rng)
     found = found_of(traced, image, rendered(traced, 4 * sky(np.random.default_rng(7))))
     assert found.left > 0.5
+
+
+@pytest.mark.parametrize("periods", [1, 2, 4])
+def test_as_many_turns_are_alike_as_a_sky_has_periods(periods, traced, rng):
+    image = np.tile(sky(rng)[:, : GRID[1] // periods], (1, periods, 1))
+    found = found_of(traced, image, rendered(traced, np.roll(image, 5, axis=1)))
+    np.testing.assert_allclose(found.alike, periods, rtol=1e-3)
 
 
 @pytest.mark.parametrize("still", [0.0, np.inf])

@@ -185,7 +185,6 @@ class Experiment:
     place: Callable[[Case], tuple] | None = None
     # In place of panels: all cases with their jobs, folders of runs and sheets, command line -> files
     draw: Callable[[list, Path, Path, argparse.Namespace], list[Path]] | None = None
-    file: Callable[[argparse.Namespace], str] = lambda given: "table"  # the table's file, without ending
     alone: bool = False  # times are measured: a case at a time, unless the command line says otherwise
 
 
@@ -318,7 +317,7 @@ def main(name: str, about: str, experiment: Experiment, argv: Sequence[str] | No
         help="compute what is missing and print the table; print the table; draw the contact sheets",
     )
     add_options(parser, Path("runs") / name)
-    parser.add_argument("--to", type=Path, metavar="DIR", help="of table.md and sheets (that of the runs)")
+    parser.add_argument("--to", type=Path, metavar="DIR", help="of the sheets (that of the runs)")
     if experiment.place:
         parser.add_argument("--count", type=int, metavar="N", help="so many cases, evenly from all kinds")
     experiment.options(parser)
@@ -346,19 +345,17 @@ def _act(name, experiment, given):
         if missing:
             print(sweep.table(missing), file=sys.stderr)
     done = done_of(cases, out)
-    to = make_folder(given.to or out)
     if given.action == "sheet":
         draw = experiment.draw
         if not draw and experiment.panels is edit_panels and cases[0][0].result == call.RESULT:
             raise ConfigError(f"there is no sheet of {name}; give run or table")
         if not done:
             raise InputError(f"{out}: {NOTHING}")
+        to = make_folder(given.to or out)
         print("\n".join(map(str, draw(cases, out, to, given) if draw else sheets(experiment, done, to))))
         return 0
     rows = rows_of(experiment, done)
-    text = table(experiment, rows)
-    write_atomically(to / f"{experiment.file(given)}.md", f"{text}\n".encode())
-    print(text)
+    print(table(experiment, rows))
     wrong = experiment.failures(rows) if experiment.failures else []
     for line in wrong:
         print(f"FAILED: {line}", file=sys.stderr)

@@ -182,5 +182,4 @@ EXPERIMENT = Experiment(
     summary=summary,
     sheet=lambda case: "{table}-{settings}-{roughness}".format(**case.about).removesuffix("-None"),
     options=options,
-    file=lambda args: args.name,
 )

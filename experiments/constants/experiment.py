@@ -9,9 +9,7 @@ from __future__ import annotations
 import ast
 import contextlib
 import importlib
-import inspect
 import math
-import re
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -101,27 +99,15 @@ def measured(settings: config.Config, folder: Path, module: str = "") -> list[di
 @contextlib.contextmanager
 def _changed(constant: Constant, value: float):
     """Change a constant wherever it has been imported."""
-    importlib.import_module("envedit.pipeline")
-    places = [
-        other
-        for key, other in sys.modules.items()
-        if key.startswith("envedit.") and not hasattr(other, "__path__")
-        if key == constant.module or _imports(other, constant)
-    ]
-    for other in places:
-        setattr(other, constant.name, value)
+    modules = [module for name, module in sys.modules.items() if name.startswith("envedit.")]
+    places = [module for module in modules if getattr(module, constant.name, None) is constant.value]
+    for module in places:
+        setattr(module, constant.name, value)
     try:
         yield
     finally:
-        for other in places:
-            setattr(other, constant.name, constant.value)
-
-
-def _imports(module, constant):
-    """Whether a module has a constant from another one."""
-    source = inspect.getsource(module)
-    text = rf"from {re.escape(constant.module)} import [^)]*?\b{constant.name}\b"
-    return hasattr(module, constant.name) and re.search(text, source) is not None
+        for module in places:
+            setattr(module, constant.name, constant.value)
 
 
 def _edits():

@@ -45,7 +45,7 @@ from envedit.cli import sweep as options
 from envedit.core import latlong
 from envedit.core.atomic_files import make_folder, write_atomically
 from envedit.core.color import tonemap
-from envedit.core.errors import ConfigError, EnveditError, InputError
+from envedit.core.errors import ConfigError, InputError
 from envedit.core.extras import required
 from envedit.images import images
 from experiments import call
@@ -131,7 +131,7 @@ class Done:
 
     @cached_property
     def maps(self) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-        """Original, edited and true map; None for a target without one, or where its file is gone."""
+        """Original, edited and true map; None for a target without one."""
         layers = OpenEXR.File(str(self.folder / "edited_layers.exr"), separate_channels=True).channels()
         original = np.stack([layers[f"initial.{c}"].pixels for c in "RGB"], axis=2)
         edited = self.picture("edited")
@@ -141,10 +141,7 @@ class Done:
             return original, edited, None
         if not asked.file:
             return original, edited, latlong.rotate(original, asked.degrees)
-        try:
-            true = images.load_envmap(asked.file, original.shape[1], settings.input.repair)[0]
-        except EnveditError:  # it may have been moved since
-            true = None
+        true, _ = images.load_envmap(asked.file, original.shape[1], settings.input.repair)
         return original, edited, true
 
     @property

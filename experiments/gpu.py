@@ -1,16 +1,7 @@
 """What a GPU does beside the CPU of the same machine: ``experiments/gpu.sh OUT.json``.
 
-Five steps, for ``cuda_ad_rgb`` first and then for ``llvm_ad_rgb``, in at most 8 minutes:
-
-- ``doctor``: the self test of ``envedit doctor``.
-- ``quickstart``: ``envedit run quickstart``, with T not from disk.
-- ``engine``: T E, T' I and a step, a step of ``prb``, and a step of the standard preset's network
-  (``experiments engine``: ``transport-sphere`` and ``siren-standard``).
-- ``solver``: an edit of 128x128 pixels and a map of 256x128 by Gauss-Newton, the second of two runs.
-- ``fit``: the paper's R-SIREN at its size, 256x128 texels, after three epochs that compile its kernels; on
-  the CPU a thirtieth of the epochs.
-
-Needs no data: the map is the analytic sky.
+Five steps for ``cuda_ad_rgb`` and then for ``llvm_ad_rgb``, in at most 8 minutes, without data: the map is
+the analytic sky. *solver* is an edit by Gauss-Newton, *fit* the paper's R-SIREN at its size.
 """
 
 from __future__ import annotations

@@ -68,7 +68,7 @@ class Counts:
 class Numbers:
     """One measure over several rows: ``count``, ``mean``, ``median``, ``min``, ``max``, ``sum``, ``rms``.
 
-    ``worst`` is the number with the largest magnitude.
+    ``geometric`` is the mean of positive numbers, ``worst`` the number with the largest magnitude.
     None and NaN are left out. ``above[0.05]`` and ``below[0]`` count the numbers on either side of a limit;
     ``[key]`` is a part of each, where they are dicts.
     """
@@ -86,6 +86,7 @@ class Numbers:
         self.max = Value(known.max())
         self.sum = Value(known.sum())
         self.rms = Value(np.sqrt(np.square(known).mean()))
+        self.geometric = Value(np.exp(np.log(known[known > 0]).mean())) if (known > 0).any() else Value("nan")
         self.worst = Value(known[np.abs(known).argmax()])
         self.above = Counts(lambda limit: (known > limit).sum())
         self.below = Counts(lambda limit: (known < limit).sum())

@@ -1,8 +1,4 @@
-"""What each constant of behaviour does: four small edits with it halved and doubled.
-
-A constant that changes nothing could be another; one that changes much is a choice, whose reason stands in
-its docstring. Constants are the numbers of ``solve`` and ``preparation``.
-"""
+"""What each constant of behaviour does: four small edits with it halved and doubled."""
 
 from __future__ import annotations
 

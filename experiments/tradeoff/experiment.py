@@ -7,12 +7,11 @@ those of the same call. Nothing else should run on the machine meanwhile.
 from __future__ import annotations
 
 import itertools
-import math
 import statistics
 
 from experiments import puresky
 from experiments.harness import Done, Experiment, calling
-from experiments.summary import Numbers, Value
+from experiments.summary import Summary
 
 from .cell import cell
 
@@ -105,49 +104,35 @@ def measure(done: Done) -> list[dict]:
     return rows
 
 
-def means(rows: list[dict]) -> list[dict]:
-    """Average every setting over its cells: ratios geometrically, differences arithmetically."""
-    found = []
-    for setting in dict.fromkeys(row["setting"] for row in rows):
-        some = [row for row in rows if row["setting"] == setting]
-        logs = {key: Numbers([math.log(row[key]) for row in some]) for key in ("time", "again", "memory")}
-        mean = {key: Numbers([row[key] for row in some]).mean for key in ("rendering", "map", "ssim", "sun")}
-        mean |= {key: Value(math.exp(one.mean)) for key, one in logs.items()}
-        found.append({"table": "settings", "setting": setting, "cells": len(some)} | mean)
-    return found
-
-
 EXPERIMENT = Experiment(
     cases,
     measure,
     {
-        "settings": {
-            "setting": "{setting}",
-            "cells": "{cells}",
-            "time": "{time:.2f}",
-            "again": "{again:.2f}",
-            "memory": "{memory:.2f}",
-            "rendering, dB": "{rendering:+.2f}",
-            "map, dB": "{map:+.2f}",
-            "map SSIM": "{ssim:+.3f}",
-            "sun off, degrees": "{sun:.1f}",
-        },
-        "runs": {
-            "cell": "{cell}",
-            "setting": "{setting}",
-            "s": "{s:.1f}",
-            "s again": "{again_s:.1f}",
-            "rendering s": "{rendering_s:.1f}",
-            "tracing and search s": "{tracing_s:.1f}",
-            "numbers s": "{numbers_s:.1f}",
-            "GB": "{gb:.2f}",
-            "rendering, dB": "{psnr:.1f}",
-            "map, dB": "{map_psnr:.1f}",
-            "map SSIM": "{map_ssim:.3f}",
-            "sun off, degrees": "{sun:.1f}",
-        },
+        "cell": "{cell}",
+        "setting": "{setting}",
+        "s": "{s:.1f}",
+        "s again": "{again_s:.1f}",
+        "rendering s": "{rendering_s:.1f}",
+        "tracing and search s": "{tracing_s:.1f}",
+        "numbers s": "{numbers_s:.1f}",
+        "GB": "{gb:.2f}",
+        "rendering, dB": "{psnr:.1f}",
+        "map, dB": "{map_psnr:.1f}",
+        "map SSIM": "{map_ssim:.3f}",
+        "sun off, degrees": "{sun:.1f}",
     },
-    group=lambda row: row["table"],
-    combine=lambda rows: means(rows) + [row | {"table": "runs"} for row in rows],
+    summary=Summary(
+        {"setting": "{setting}"},
+        {
+            "cells": "{runs}",
+            "time": "{time.geometric:.2f}",
+            "again": "{again.geometric:.2f}",
+            "memory": "{memory.geometric:.2f}",
+            "rendering, dB": "{rendering.mean:+.2f}",
+            "map, dB": "{map.mean:+.2f}",
+            "map SSIM": "{ssim.mean:+.3f}",
+            "sun off, degrees": "{sun.mean:.1f}",
+        },
+    ),
     alone=True,
 )

@@ -1,7 +1,4 @@
-"""Clip maps at four levels and as 8-bit pictures, give their sun back, and compare with the truth.
-
-13 PureSky maps, four of which no choice has seen, and four of ENVEDIT_DATA/hdri: rooms, a low sun, a night.
-"""
+"""Clip maps at four levels and as 8-bit pictures, give their sun back, and compare with the truth."""
 
 import numpy as np
 

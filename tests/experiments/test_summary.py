@@ -21,6 +21,7 @@ def test_numbers_are_counted_and_what_is_not_known_is_a_dash():
     text = Summary({}, {"": "{seam.above[2.5]} {seam.above[3]} {seam.below[3]} {seam.median:.1f}"})(ROWS)
     assert text.endswith("| 2 1 1 3.0 |")
     assert f"{Value('nan'):.1f} {Value(0.125):+.1%} {Value(2):.1f}" == "- +12.5 % 2.0"
+    assert f"{Numbers([0.5, 8.0, None]).geometric:.1f}" == "2.0"
     assert f"{Numbers([None]).max:.1f}" == "-" and Numbers([]).above[0] == 0
     row = values({"a": None, "b": 0.5, "c": "text", "d": [1.0], "e": 3})
     assert "{a:.1f} {b:.0%} {c} {e}".format_map(row) == "- 50 % text 3"

@@ -27,9 +27,9 @@ from envedit.core.errors import InputError
 from envedit.sweep.process import CONFIG
 from experiments import puresky
 from experiments.harness import Done, Experiment, calling
+from experiments.painted_edits import experiment as painted_edits
 
 MAP = "kloofendal_48d_partly_cloudy"
-EDITS = Path(__file__).parents[2] / "scenes/edits"
 CORNER_S, SETTING_S = 0.4, 1.0
 TEXT = "document.querySelector('[data-testid=status]').textContent"
 STATUS = f"() => {TEXT}.includes"
@@ -42,14 +42,6 @@ FEASIBLE, RENDERED = f"{STATUS}('% feasible')", f"{STATUS}('with 256 samples')"
 SETTLED = f"() => /how much of the target|% feasible/.test({TEXT})"
 DIFFERS = re.compile(r"differs from the one shown before by (\S+) of a display value")
 SAVED = "() => document.querySelector('[data-testid=message]').textContent.includes('Saved in')"
-TITLES = {
-    "move_shadow": "Moving the shadow",
-    "add_reflection": "Adding a reflection",
-    "add_shadow": "Adding a shadow",
-    "warmer": "Colour temperature",
-    "enhance_shadow": "Enhancing the shadow",
-    "blur_shadow": "Blurring the shadow",
-}
 
 
 def prepared(folder: Path) -> Path:
@@ -209,10 +201,10 @@ def edit(settings, folder, strokes) -> dict:
 def cases(given):
     sky = puresky.file(MAP)
     found = []
-    for name, title in TITLES.items():
-        asked = tomllib.loads((EDITS / f"{name}.toml").read_text())
+    for name in painted_edits.EDITS:
+        asked = tomllib.loads((painted_edits.FOLDER / f"{name}.toml").read_text())
         tables = {"input": {"envmap": sky}, "scene": asked["scene"]}
-        found.append(calling(name, edit, tables, {"edit": title}, strokes=asked["target"]["strokes"]))
+        found.append(calling(name, edit, tables, {"edit": name}, strokes=asked["target"]["strokes"]))
     return found
 
 

@@ -20,7 +20,7 @@ def test_the_six_edits(tmp_path, monkeypatch):
     (tmp_path / "puresky" / f"{figure10.MAP}_puresky_1k.hdr").write_text("a map")
     monkeypatch.setenv("ENVEDIT_DATA", str(tmp_path))
     cases = {case.name: case for case in figure10.cases(None)}
-    assert list(cases) == list(figure10.TITLES)
+    assert list(cases) == list(figure10.painted_edits.EDITS)
     strokes = json.loads(cases["add_reflection"].command[-1])["strokes"]
     row = {"edit": "E", "strokes": [*strokes, {"type": "temperature"}]}
     row |= {"painted_s": 6.1, "solved_s": 5.9, "settled_s": 4.8, "differs": 0.0001, "saved_s": 9.0}

@@ -180,8 +180,7 @@ class Experiment:
     options: Callable[[argparse.ArgumentParser], None] = lambda parser: None  # adds the experiment's own
     # Kind of a case and its rank there, as one tuple; adds --count N: so many cases, of each kind in turn
     place: Callable[[Case], tuple] | None = None
-    # In place of panels: all cases with their jobs, folders of runs and sheets, command line -> files
-    draw: Callable[[list, Path, Path, argparse.Namespace], list[Path]] | None = None
+    draw: Callable[[list[Done], Path], list[Path]] | None = None  # in place of panels: folder -> files
     alone: bool = False  # times are measured: a case at a time, unless the command line says otherwise
 
 
@@ -293,15 +292,6 @@ def figure(file: Path, rows: int, columns: int, size: tuple[float, float], **sub
 # ---- command line ------------------------------------------------------------------------------------------
 
 
-def add_options(parser: argparse.ArgumentParser, out: Path) -> None:
-    """Add the options that every experiment has."""
-    parser.add_argument("--out", type=Path, default=out, metavar="DIR", help="of the runs (%(default)s)")
-    parser.add_argument("--only", nargs="+", default=[], metavar="TEXT", help="names of cases, or parts")
-    parser.add_argument("--set", action="append", default=[], dest="sets", metavar="table.key=value")
-    parser.add_argument("--dry-run", action="store_true", help="list the cases; compute nothing")
-    options.add_options(parser)
-
-
 def main(name: str, about: str, experiment: Experiment, argv: Sequence[str] | None = None) -> int:
     """Run the command line of an experiment of a name, which its help says about; returns the exit code.
 
@@ -313,7 +303,12 @@ def main(name: str, about: str, experiment: Experiment, argv: Sequence[str] | No
         choices=("run", "table", "sheet"),
         help="compute what is missing and print the table; print the table; draw the contact sheets",
     )
-    add_options(parser, Path("runs") / name)
+    out = Path("runs") / name
+    parser.add_argument("--out", type=Path, default=out, metavar="DIR", help="of the runs (%(default)s)")
+    parser.add_argument("--only", nargs="+", default=[], metavar="TEXT", help="names of cases, or parts")
+    parser.add_argument("--set", action="append", default=[], dest="sets", metavar="table.key=value")
+    parser.add_argument("--dry-run", action="store_true", help="list the cases; compute nothing")
+    options.add_options(parser)
     parser.add_argument("--to", type=Path, metavar="DIR", help="of the sheets (that of the runs)")
     if experiment.place:
         parser.add_argument("--count", type=int, metavar="N", help="so many cases, evenly from all kinds")
@@ -349,7 +344,7 @@ def _act(name, experiment, given):
         if not done:
             raise InputError(f"{out}: {NOTHING}")
         to = make_folder(given.to or out)
-        print("\n".join(map(str, draw(cases, out, to, given) if draw else sheets(experiment, done, to))))
+        print("\n".join(map(str, draw(done, to) if draw else sheets(experiment, done, to))))
         return 0
     rows = rows_of(experiment, done)
     print(table(experiment, rows))

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.harness import Experiment, calling, done_of, figure
+from experiments.harness import Experiment, calling, figure
 from experiments.paint.figure10 import RENDERED, drag, opened, place, prepared
 
 BUTTONS = "button:visible:enabled:not(#save, #look, #light-image, .grip)"
@@ -150,10 +150,10 @@ def failures(rows) -> list[str]:
     return found
 
 
-def draw(cases, out, to, given):
+def draw(done, to):
     """Draw the server's memory over time: ``memory.png``."""
     with figure(to / "memory.png", 1, 1, (7, 2.8), squeeze=False) as panels:
-        for one in done_of(cases, out):
+        for one in done:
             seconds, memory = np.array(one.metrics["memory"]).T
             panels[0, 0].plot(seconds / 60, memory, linewidth=0.8)
         panels[0, 0].set(xlabel="minutes of random use", ylabel="memory of the server, MB", ylim=(0, None))

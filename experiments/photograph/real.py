@@ -17,6 +17,7 @@ import mitsuba as mi
 import numpy as np
 
 import envedit
+from envedit.core import latlong
 from envedit.core.atomic_files import make_folder
 from envedit.core.color import tonemap
 from envedit.images import images
@@ -69,7 +70,7 @@ def draw(folder: Path) -> None:
     for name in SIZES:
         edited_map = images.read(folder / name / "edited.exr")[0]
         pictures = [images.read_stored(folder / name / "photograph.png")[0] / 255]
-        pictures += [tonemap(one / 4, "gamma") for one in (studio, edited_map)]
+        pictures += [tonemap(latlong.resize(one, 200, 400) / 4, "gamma") for one in (studio, edited_map)]
         if name == "coffee":
             pictures.append(images.read_stored(folder / "inserted.png")[0] / 255)
         rows.append(pictures)

@@ -77,7 +77,7 @@ def clipped(radiance: np.ndarray, level: str) -> tuple[np.ndarray, float]:
     return srgb_to_linear(codes / 255).astype(np.float32), exposure
 
 
-def truth(radiance: np.ndarray, name: str) -> Truth:
+def truth(radiance: np.ndarray) -> Truth:
     """Measure the sun of an unclipped map: the core of the light of :func:`.separate` with most flux.
 
     Where there is no light above the horizon, what is around the brightest texel.
@@ -102,8 +102,7 @@ def truth(radiance: np.ndarray, name: str) -> Truth:
     core = angle < CORE_DEGREES
     flux = float((np.maximum(lum - np.median(lum[around]), 0) * omega)[core].sum())
     sky = float((lum * omega * np.maximum(directions[..., 1], 0))[~core].sum())
-    sunny = name not in ROOMS and bool(lights) and flux > SUNNY * sky
-    return Truth(direction, flux, sky, sunny)
+    return Truth(direction, flux, sky, bool(lights) and flux > SUNNY * sky)
 
 
 def horizontal(radiance: np.ndarray) -> float:

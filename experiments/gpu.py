@@ -1,16 +1,7 @@
 """What a GPU does beside the CPU of the same machine: ``experiments/gpu.sh OUT.json``.
 
-Five steps, for ``cuda_ad_rgb`` first and then for ``llvm_ad_rgb``, in at most 8 minutes:
-
-- ``doctor``: the self test of ``envedit doctor``.
-- ``quickstart``: ``envedit run quickstart``, with T not from disk.
-- ``engine``: T E, T' I and a step, a step of ``prb``, and a step of the standard preset's network
-  (``experiments engine``: ``transport-sphere`` and ``siren-standard``).
-- ``solver``: an edit of 128x128 pixels and a map of 256x128 by Gauss-Newton, the second of two runs.
-- ``fit``: the paper's R-SIREN at its size, 256x128 texels, after three epochs that compile its kernels; on
-  the CPU a thirtieth of the epochs.
-
-Needs no data: the map is the analytic sky.
+Five steps for ``cuda_ad_rgb`` and then for ``llvm_ad_rgb``, in at most 8 minutes, without data: the map is
+the analytic sky. *solver* is an edit by Gauss-Newton, *fit* the paper's R-SIREN at its size.
 """
 
 from __future__ import annotations
@@ -30,31 +21,21 @@ from envedit.core.atomic_files import write_atomically
 
 GPU, CPU = "cuda_ad_rgb", "llvm_ad_rgb"
 MINUTES = 8
-EPOCHS, CPU_EPOCHS = 1500, 50
-"""Of the paper's fit, and how many of them are measured on the CPU."""
-STEPS = ("doctor", "quickstart", "engine", "solver", "fit")
-
-
-def commands(step: str, variant: str, folder: str, small: bool) -> list[list[str]]:
-    """Return the commands of a step, one after the other; the last one is measured, the others warm up."""
-    python = [sys.executable, "-m"]
-    variable = ["--set", f"variant={variant}"]
-    run = [*python, "envedit", "run", "--json", "--quiet", "--out", folder, *variable]
-    sizes = ["--set", f"input.width={32 if small else 256}", "--set", f"scene.width={16 if small else 128}"]
-    if step == "doctor":
-        return [[*python, "envedit", "doctor", "--variant", variant]]
-    if step == "quickstart":
-        return [[*run, "quickstart", "--set", "renderer.cache=false", *(sizes if small else [])]]
-    if step == "engine":
-        chosen = ["--only", "siren-standard", "transport-sphere", "--out", folder]
-        return [[*python, "experiments", "engine", "run", *chosen, *variable, *["--quick"] * small]]
-    if step == "solver":
-        edit = ["sphere", "--envmap", "sunsky", "--rotate", "60", "--set", "representation.turn=false"]
-        return 2 * [[*run, *edit, *sizes]]
-    epochs = 6 if small else CPU_EPOCHS if variant == CPU else EPOCHS
-    fit = [*python, "envedit", "fit", "sunsky", "--preset", "paper", "--out", folder, *variable, *sizes[:2]]
-    fit += ["--set", "fit.cache=false"]
-    return [[*fit, "--set", f"fit.epochs={count}"] for count in (3, epochs)]
+EPOCHS = {GPU: 1500, CPU: 50}
+"""How many of the paper's epochs are measured."""
+SIZES = "--set input.width=256 --set scene.width=128"
+RUN = "envedit run --json --quiet --out {folder} --set variant={variant}"
+FIT = "envedit fit sunsky --preset paper --out {folder} --set variant={variant} --set fit.cache=false {sizes}"
+STEPS = {
+    "doctor": ["envedit doctor --variant {variant}"],
+    "quickstart": [f"{RUN} quickstart --set renderer.cache=false"],
+    "engine": [
+        "experiments engine run --only siren-standard transport-sphere --out {folder} --set variant={variant}"
+    ],
+    "solver": 2 * [f"{RUN} sphere --envmap sunsky --rotate 60 --set representation.turn=false {{sizes}}"],
+    "fit": [f"{FIT} --set fit.epochs=3", f"{FIT} --set fit.epochs={{epochs}}"],
+}
+"""Commands of each step, one after the other; the last one is measured, the others warm up."""
 
 
 def result(step: str, folder: str, printed: str) -> dict[str, Any]:
@@ -73,18 +54,22 @@ def result(step: str, folder: str, printed: str) -> dict[str, Any]:
     return {"psnr": quality, "iterations": metrics["iterations"], "timing": metrics["timing"]}
 
 
-def measured(step: str, variant: str, left: float, small: bool = False) -> dict[str, Any]:
-    """Carry out a step within seconds; a failure is an ``error`` among what was measured.
-
-    ``small``: at tiny sizes, to test this program.
-    """
+def measured(step: str, variant: str, left: float) -> dict[str, Any]:
+    """Carry out a step within seconds; a failure is an ``error`` among what was measured."""
     end = time.monotonic() + left
     with tempfile.TemporaryDirectory() as folder:
-        for command in commands(step, variant, folder, small):
+        for command in STEPS[step]:
             begun = time.perf_counter()
+            line = command.format(
+                folder=folder, variant=variant, sizes=SIZES, epochs=EPOCHS.get(variant)
+            ).split()
             try:
-                rest = max(end - time.monotonic(), 0)
-                ran = subprocess.run(command, capture_output=True, text=True, timeout=rest)
+                ran = subprocess.run(
+                    [sys.executable, "-m", *line],
+                    capture_output=True,
+                    text=True,
+                    timeout=max(end - time.monotonic(), 0),
+                )
             except subprocess.TimeoutExpired:
                 return {"error": f"not done after {left:.0f} s"}
             if ran.returncode:

@@ -45,7 +45,7 @@ from envedit.cli import sweep as options
 from envedit.core import latlong
 from envedit.core.atomic_files import make_folder, write_atomically
 from envedit.core.color import tonemap
-from envedit.core.errors import ConfigError, EnveditError, InputError
+from envedit.core.errors import ConfigError, InputError
 from envedit.core.extras import required
 from envedit.images import images
 from experiments import call
@@ -131,7 +131,7 @@ class Done:
 
     @cached_property
     def maps(self) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-        """Original, edited and true map; None for a target without one, or where its file is gone."""
+        """Original, edited and true map; None for a target without one."""
         layers = OpenEXR.File(str(self.folder / "edited_layers.exr"), separate_channels=True).channels()
         original = np.stack([layers[f"initial.{c}"].pixels for c in "RGB"], axis=2)
         edited = self.picture("edited")
@@ -141,10 +141,7 @@ class Done:
             return original, edited, None
         if not asked.file:
             return original, edited, latlong.rotate(original, asked.degrees)
-        try:
-            true = images.load_envmap(asked.file, original.shape[1], settings.input.repair)[0]
-        except EnveditError:  # it may have been moved since
-            true = None
+        true, _ = images.load_envmap(asked.file, original.shape[1], settings.input.repair)
         return original, edited, true
 
     @property
@@ -183,9 +180,7 @@ class Experiment:
     options: Callable[[argparse.ArgumentParser], None] = lambda parser: None  # adds the experiment's own
     # Kind of a case and its rank there, as one tuple; adds --count N: so many cases, of each kind in turn
     place: Callable[[Case], tuple] | None = None
-    # In place of panels: all cases with their jobs, folders of runs and sheets, command line -> files
-    draw: Callable[[list, Path, Path, argparse.Namespace], list[Path]] | None = None
-    file: Callable[[argparse.Namespace], str] = lambda given: "table"  # the table's file, without ending
+    draw: Callable[[list[Done], Path], list[Path]] | None = None  # in place of panels: folder -> files
     alone: bool = False  # times are measured: a case at a time, unless the command line says otherwise
 
 
@@ -297,15 +292,6 @@ def figure(file: Path, rows: int, columns: int, size: tuple[float, float], **sub
 # ---- command line ------------------------------------------------------------------------------------------
 
 
-def add_options(parser: argparse.ArgumentParser, out: Path) -> None:
-    """Add the options that every experiment has."""
-    parser.add_argument("--out", type=Path, default=out, metavar="DIR", help="of the runs (%(default)s)")
-    parser.add_argument("--only", nargs="+", default=[], metavar="TEXT", help="names of cases, or parts")
-    parser.add_argument("--set", action="append", default=[], dest="sets", metavar="table.key=value")
-    parser.add_argument("--dry-run", action="store_true", help="list the cases; compute nothing")
-    options.add_options(parser)
-
-
 def main(name: str, about: str, experiment: Experiment, argv: Sequence[str] | None = None) -> int:
     """Run the command line of an experiment of a name, which its help says about; returns the exit code.
 
@@ -317,8 +303,13 @@ def main(name: str, about: str, experiment: Experiment, argv: Sequence[str] | No
         choices=("run", "table", "sheet"),
         help="compute what is missing and print the table; print the table; draw the contact sheets",
     )
-    add_options(parser, Path("runs") / name)
-    parser.add_argument("--to", type=Path, metavar="DIR", help="of table.md and sheets (that of the runs)")
+    out = Path("runs") / name
+    parser.add_argument("--out", type=Path, default=out, metavar="DIR", help="of the runs (%(default)s)")
+    parser.add_argument("--only", nargs="+", default=[], metavar="TEXT", help="names of cases, or parts")
+    parser.add_argument("--set", action="append", default=[], dest="sets", metavar="table.key=value")
+    parser.add_argument("--dry-run", action="store_true", help="list the cases; compute nothing")
+    options.add_options(parser)
+    parser.add_argument("--to", type=Path, metavar="DIR", help="of the sheets (that of the runs)")
     if experiment.place:
         parser.add_argument("--count", type=int, metavar="N", help="so many cases, evenly from all kinds")
     experiment.options(parser)
@@ -346,19 +337,17 @@ def _act(name, experiment, given):
         if missing:
             print(sweep.table(missing), file=sys.stderr)
     done = done_of(cases, out)
-    to = make_folder(given.to or out)
     if given.action == "sheet":
         draw = experiment.draw
         if not draw and experiment.panels is edit_panels and cases[0][0].result == call.RESULT:
             raise ConfigError(f"there is no sheet of {name}; give run or table")
         if not done:
             raise InputError(f"{out}: {NOTHING}")
-        print("\n".join(map(str, draw(cases, out, to, given) if draw else sheets(experiment, done, to))))
+        to = make_folder(given.to or out)
+        print("\n".join(map(str, draw(done, to) if draw else sheets(experiment, done, to))))
         return 0
     rows = rows_of(experiment, done)
-    text = table(experiment, rows)
-    write_atomically(to / f"{experiment.file(given)}.md", f"{text}\n".encode())
-    print(text)
+    print(table(experiment, rows))
     wrong = experiment.failures(rows) if experiment.failures else []
     for line in wrong:
         print(f"FAILED: {line}", file=sys.stderr)

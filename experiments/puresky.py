@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,7 @@ from envedit.core.errors import ConfigError, InputError
 from envedit.images import images
 from experiments.harness import Case, calling
 
-_NAME = re.compile(r"(?P<name>.+)_puresky_(?P<size>[1-9][0-9]?)k\.(?P<kind>hdr|exr)")
+_END = "_puresky_1k"
 _HOW = "python -m experiments.download_puresky DIR fetches them"
 
 
@@ -28,22 +27,15 @@ def data(holds: str = "puresky/NAME_puresky_1k.hdr", how: str = _HOW) -> Path:
     return Path(root)
 
 
-def find(folder: str | Path | None = None) -> dict[str, Path]:
-    """List the maps of a folder by name; without one, of the folder ``puresky`` of ENVEDIT_DATA.
+def find() -> dict[str, Path]:
+    """List the maps of the folder ``puresky`` of ENVEDIT_DATA by name: files NAME_puresky_1k.hdr, or .exr.
 
-    Files are NAME_puresky_1k.hdr, or .exr, or of another resolution: of several the smallest is taken.
-    InputError if it is no folder, or holds no map; ConfigError as :func:`data`.
+    InputError if there is none; ConfigError as :func:`data`.
     """
-    folder = Path(folder or data() / "puresky").absolute()
-    if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder of maps; {_HOW}")
-    matches = [match for path in folder.iterdir() if (match := _NAME.fullmatch(path.name))]
-    matches.sort(key=lambda m: (m["name"], int(m["size"]), m["kind"] != "hdr"))
-    if not matches:
-        raise InputError(f"{folder}: no map NAME_puresky_1k.hdr or .exr in it; {_HOW}")
-    found: dict[str, Path] = {}
-    for match in matches:
-        found.setdefault(match["name"], folder / match[0])
+    folder = (data() / "puresky").absolute()
+    found = {path.name.split(_END)[0]: path for path in sorted(folder.glob(f"*{_END}.[he][dx]r"))}
+    if not found:
+        raise InputError(f"{folder}: no map NAME{_END}.hdr or .exr in this folder; {_HOW}")
     return found
 
 

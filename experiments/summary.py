@@ -21,6 +21,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+SCALES = (1e9, "G"), (1e6, "M"), (1e3, "k"), (1, ""), (1e-3, "m"), (1e-6, "u")
+"""Factors of a number, and their prefixes."""
+
 
 def markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """Return a table."""
@@ -28,11 +31,28 @@ def markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 class Value(float):
-    """A number that is written as a dash where it is not known (NaN), and by ``.0%`` as ``12 %``."""
+    """A number that is written as a dash where it is not known (NaN), and by ``.0%`` as ``12 %``.
+
+    Further forms: ``.3g%`` is a share in percent with three digits, ``si B`` a number with three digits, a
+    prefix and a unit (12.3 MB, 45.6 ms; seconds from 100 on are whole).
+    """
 
     def __format__(self, form: str) -> str:
         """Write the number."""
-        return "-" if self != self else super().__format__(form).replace("%", " %")
+        if self != self:
+            return "-"
+        if form.startswith("si"):
+            return self._with_prefix(form[2:].strip())
+        if form.endswith("g%"):
+            return f"{100 * float(self):{form[:-1]}} %"
+        return super().__format__(form).replace("%", " %")
+
+    def _with_prefix(self, unit):
+        if unit == "s" and self >= 100:
+            return f"{self:.0f} s"
+        factor, prefix = next((scale for scale in SCALES if self >= scale[0]), (1, ""))
+        digits = max(0, 3 - len(str(int(self / factor))))
+        return f"{self / factor:.{digits}f} {prefix}{unit}".rstrip()
 
     def __getitem__(self, key):
         """Return an unknown part of something unknown, such as the PSNR of a map that there is not."""
@@ -42,7 +62,7 @@ class Value(float):
 def values(row: dict) -> dict:
     """Return a row, such as of ``metrics.json``, whose numbers, and None, are :class:`Value`.
 
-    Columns write parts of it as ``{render[psnr]:.1f}``. Texts, lists and counts stay.
+    Columns write parts of it as ``{render[psnr]:.1f}``. Texts and lists stay; counts are :class:`Count`.
     """
     return {key: _value(value) for key, value in row.items()}
 
@@ -52,7 +72,17 @@ def _value(content):
         return values(content)
     if content is None or isinstance(content, float):
         return Value("nan" if content is None else content)
+    if type(content) is int:
+        return Count(content)
     return content
+
+
+class Count(int):
+    """A whole number, which has the forms of :class:`Value` as well."""
+
+    def __format__(self, form: str) -> str:
+        """Write the number."""
+        return format(Value(self), form) if form.startswith("si") else super().__format__(form)
 
 
 @dataclass(frozen=True)
@@ -68,7 +98,7 @@ class Counts:
 class Numbers:
     """One measure over several rows: ``count``, ``mean``, ``median``, ``min``, ``max``, ``sum``, ``rms``.
 
-    ``worst`` is the number with the largest magnitude.
+    ``geometric`` is the mean of positive numbers, ``worst`` the number with the largest magnitude.
     None and NaN are left out. ``above[0.05]`` and ``below[0]`` count the numbers on either side of a limit;
     ``[key]`` is a part of each, where they are dicts.
     """
@@ -86,6 +116,7 @@ class Numbers:
         self.max = Value(known.max())
         self.sum = Value(known.sum())
         self.rms = Value(np.sqrt(np.square(known).mean()))
+        self.geometric = Value(np.exp(np.log(known[known > 0]).mean())) if (known > 0).any() else Value("nan")
         self.worst = Value(known[np.abs(known).argmax()])
         self.above = Counts(lambda limit: (known > limit).sum())
         self.below = Counts(lambda limit: (known < limit).sum())

@@ -1,17 +1,11 @@
-"""What each constant of behaviour does: four small edits with it halved and doubled.
-
-A constant that changes nothing could be another; one that changes much is a choice, whose reason stands in
-its docstring. Constants are the numbers of ``solve`` and ``preparation``.
-"""
+"""What each constant of behaviour does: four small edits with it halved and doubled."""
 
 from __future__ import annotations
 
 import ast
 import contextlib
 import importlib
-import inspect
 import math
-import re
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -41,6 +35,8 @@ EDITS: dict[str, dict] = {
     },
     "shadow painted": {"target": {"kind": "strokes", "strokes": [SHADOW]}},
 }
+KINDS = "rendering", "map", "paint"
+"""Numbers of an edit: PSNR of rendering and map, dB, and percent of the paint."""
 BASE = {
     "input": {"envmap": "sunsky", "width": 64},
     "scene": {"file": "sphere", "width": 48},
@@ -89,39 +85,28 @@ def scaled(value: float, factor: float) -> float:
 def measured(settings: config.Config, folder: Path, module: str = "") -> list[dict]:
     """Make the edits with each constant of a module halved and doubled; without a module, as they are."""
     if not module:
-        return [{"constant": "", "change": "", "edits": _edits()}]
+        return [{"constant": "", "edits": _edits()}]
     rows = []
     for one in constants():
         for change, factor in FACTORS.items() if one.module == module else ():
             with _changed(one, scaled(one.value, factor)):
-                rows.append({"constant": one.label, "change": change, "edits": _edits()})
+                about = {"constant": one.label, "value": one.value, "change": change}
+                rows.append(about | {"edits": _edits()})
     return rows
 
 
 @contextlib.contextmanager
 def _changed(constant: Constant, value: float):
     """Change a constant wherever it has been imported."""
-    importlib.import_module("envedit.pipeline")
-    places = [
-        other
-        for key, other in sys.modules.items()
-        if key.startswith("envedit.") and not hasattr(other, "__path__")
-        if key == constant.module or _imports(other, constant)
-    ]
-    for other in places:
-        setattr(other, constant.name, value)
+    modules = [module for name, module in sys.modules.items() if name.startswith("envedit.")]
+    places = [module for module in modules if getattr(module, constant.name, None) is constant.value]
+    for module in places:
+        setattr(module, constant.name, value)
     try:
         yield
     finally:
-        for other in places:
-            setattr(other, constant.name, constant.value)
-
-
-def _imports(module, constant):
-    """Whether a module has a constant from another one."""
-    source = inspect.getsource(module)
-    text = rf"from {re.escape(constant.module)} import [^)]*?\b{constant.name}\b"
-    return hasattr(module, constant.name) and re.search(text, source) is not None
+        for module in places:
+            setattr(module, constant.name, constant.value)
 
 
 def _edits():
@@ -151,42 +136,37 @@ def cases(given) -> list[Case]:
 def combine(rows: list[dict]) -> list[dict]:
     """Return a row a constant: by how much numbers differ from those of the edits as they are."""
     base = next(row["edits"] for row in rows if not row["constant"])
-    by_label = {one.label: one for one in constants()}
     combined: dict[str, dict] = {}
     for row in rows:
-        if not row["constant"]:
-            continue
-        changes: dict[str, float] = {"rendering": 0.0, "map": 0.0, "paint": 0.0}
-        for edit, numbers in row["edits"].items():
-            for kind in changes:
-                change = numbers.get(kind, math.nan) - base[edit].get(kind, math.nan)
-                if change == change:
-                    changes[kind] = max(changes[kind], change, key=abs)
-            if "failed" in numbers:
-                changes = dict.fromkeys(changes, math.nan)
-        label = row["constant"]
-        if label in by_label:
-            combined.setdefault(label, {"constant": by_label[label]})[row["change"]] = changes
-    return list(combined.values())
+        if row["constant"]:
+            unknown = {"constant": row["constant"], "value": row["value"]} | dict.fromkeys(FACTORS)
+            found = combined.setdefault(row["constant"], unknown)
+            found[row["change"]] = largest_changes(row["edits"], base)
+    return [values(row) for row in combined.values()]
 
 
-def _changes(change):
-    def text(row):
-        found = row.get(change)
-        if found is None:
-            return "-"
-        return "{rendering:+.1f}, {map:+.1f}, {paint:+.1f}".format_map(values(found))
+def largest_changes(edits: dict, base: dict) -> dict[str, float]:
+    """Return the changes of the edits that changed most; NaN where one failed."""
+    if any("failed" in numbers for numbers in edits.values()):
+        return dict.fromkeys(KINDS, math.nan)
+    changes = dict.fromkeys(KINDS, 0.0)
+    for edit, numbers in edits.items():
+        for kind in KINDS:
+            change = numbers[kind] - base[edit].get(kind, math.nan)
+            if change == change:
+                changes[kind] = max(changes[kind], change, key=abs)
+    return changes
 
-    return text
 
+CHANGES = "{{{0}[rendering]:+.1f}}, {{{0}[map]:+.1f}}, {{{0}[paint]:+.1f}}"
 
 EXPERIMENT = Experiment(
     cases=cases,
     combine=combine,
     columns={
-        "constant": lambda row: f"`{row['constant'].label}`",
-        "value": lambda row: f"{row['constant'].value:.4g}",
-        "halved: dB, dB, %": _changes("halved"),
-        "doubled: dB, dB, %": _changes("doubled"),
+        "constant": "`{constant}`",
+        "value": "{value:.4g}",
+        "halved: dB, dB, %": CHANGES.format("halved"),
+        "doubled: dB, dB, %": CHANGES.format("doubled"),
     },
 )

@@ -17,7 +17,7 @@ from envedit.images.analytic_sky import sunsky
 from envedit.losses import metrics
 from envedit.scene.path_tracer import PathTracer
 from envedit.transport.light_transport import LightTransport
-from experiments.harness import Experiment, calling, done_of, figure
+from experiments.harness import Experiment, calling, figure
 
 WIDTH = 32
 """Texels across the map, and pixels across the picture."""
@@ -153,9 +153,8 @@ def combine(rows):
     return [row | {"ratio": row["step_s"] / least} for row in rows]
 
 
-def draw(made, out, to, given):
+def draw(done, to):
     """Draw losses and map over steps, and the maps of some steps below: ``divergence.png``."""
-    done = done_of(made, out)
     titles = {"loss": "loss, judged by Mitsuba", "psnr": "map PSNR, dB", "noise": "noise of the gradient"}
     ratios = [3.4, *[1] * len(done)]
     size = 11, 3.4 + 0.95 * len(done)

@@ -9,7 +9,7 @@ import sys
 
 from envedit.core import shipped
 from experiments import puresky
-from experiments.harness import Experiment, calling, done_of, rows_of
+from experiments.harness import Experiment, calling, rows_of
 
 from . import tables, timing
 
@@ -99,6 +99,6 @@ EXPERIMENT = Experiment(
     failures=tables.failures,
     summary=tables.summary,
     options=options,
-    draw=lambda cases, out, to, given: tables.draw(rows_of(EXPERIMENT, done_of(cases, out)), to),
+    draw=lambda done, to: tables.draw(rows_of(EXPERIMENT, done), to),
     alone=True,
 )

@@ -1,6 +1,5 @@
 """The results as tables, one for each name; what must hold of any of them; and two figures."""
 
-import math
 from pathlib import Path
 
 from experiments.harness import figure
@@ -12,47 +11,14 @@ PICTURE = 0.05
 """RMSE of T's picture under a one-texel sun, 24x24 pixels; a lost or doubled tier is off by 0.5 or more."""
 
 
-# ---- forms -------------------------------------------------------------------------------------------------
-
-
-def si(value: float | None, unit: str = "") -> str:
-    """Write a number with three digits and a prefix: 0.0123 s is 12.3 ms."""
-    if not value or not math.isfinite(value):
-        return "-" if value is None or value != value else f"{value:g} {unit}".rstrip()
-    scales = ((1e9, "G"), (1e6, "M"), (1e3, "k"), (1, ""), (1e-3, "m"), (1e-6, "u"))
-    factor, prefix = next((scale for scale in scales if abs(value) >= scale[0]), scales[-1])
-    digits = max(0, 2 - len(str(int(abs(value) / factor))) + 1)
-    return f"{value / factor:.{digits}f} {prefix}{unit}".rstrip()
-
-
-def seconds(value: float | None) -> str:
-    """Write a duration: 1200 s, 12.3 ms."""
-    return f"{value:.0f} s" if value and value >= 100 else si(value, "s")
-
-
-def percent(value: float) -> str:
-    """Write a share in percent with three digits."""
-    return f"{100 * value:.3g} %"
-
-
-def of(key: str, write=seconds, *arguments):
-    """Return a column: what ``write`` makes of a row's number."""
-    return lambda row: write(row[key], *arguments)
-
-
-def median_and_best(key: str):
-    """Return a column of times."""
-    return lambda row: f"{seconds(row[key]['median_s'])} ({seconds(row[key]['min_s'])})"
-
-
 # ---- tables ------------------------------------------------------------------------------------------------
 
 SIZE = {"scene": "{scene}", "pixels": "{pixels}x{pixels}", "texels": "{texels[1]}x{texels[0]}"}
 SUN = {"scene": "{scene}", "sun at": "{sun}"}
 ERROR = {
-    "RMSE": of("rmse", percent),
-    "of it the reference's noise": of("noise", percent),
-    "without it": of("corrected", percent),
+    "RMSE": "{rmse:.3g%}",
+    "of it the reference's noise": "{noise:.3g%}",
+    "without it": "{corrected:.3g%}",
 }
 COLUMNS = {
     "machine": {
@@ -64,24 +30,24 @@ COLUMNS = {
     },
     "bandwidth": {
         "streaming": "{streaming}",
-        "bytes a second": of("rate", si, "B/s"),
-        "array": of("array_bytes", si, "B"),
-        "largest cache": of("cache_bytes", si, "B"),
+        "bytes a second": "{rate:si B/s}",
+        "array": "{array_bytes:si B}",
+        "largest cache": "{cache_bytes:si B}",
     },
     "matmul": {"width": "{width}", "points": "{points:,}", "a point is a": lambda r: r["layout"][:-1]}
     | {
         f"{product}, GFLOP/s": f"{{{product}:.0f}}"
         for product in ("forward", "gradient of the weights", "gradient of the input")
     },
-    "rays": {"rays": "{rays}", "at once": "{count:,}", "rays a second": of("rate", si)},
+    "rays": {"rays": "{rays}", "at once": "{count:,}", "rays a second": "{rate:si}"},
     "siren": {
         "network": "{hidden}x{depth} ({preset})",
         "points": "{points:,}",
-        "forward": lambda r: seconds(r["forward"]["median_s"]),
-        "forward + backward": median_and_best("step"),
-        "its products alone": median_and_best("own"),
+        "forward": "{forward[median_s]:si s}",
+        "forward + backward": "{step[median_s]:si s} ({step[min_s]:si s})",
+        "its products alone": "{own[median_s]:si s} ({own[min_s]:si s})",
         "ratio": "{ratio:.2f}",
-        "PyTorch": lambda r: seconds(r["torch"]["median_s"]),
+        "PyTorch": "{torch[median_s]:si s}",
         "GFLOP/s": "{gflops:.0f}",
         "compiled after warm-up": "{kernels[compiled]} of {kernels[launched]}",
     },
@@ -91,52 +57,52 @@ COLUMNS = {
         "spp": "{spp}",
         "path depth": "{depth}",
         "exact columns": "{columns}",
-        "held": of("held", si, "B"),
-        "traced in (first time)": lambda r: f"{seconds(r['again_s'])} ({seconds(r['first_s'])})",
-        "columns in": of("resolve_s"),
-        "loaded in": of("load_s"),
+        "held": "{held:si B}",
+        "traced in (first time)": "{again_s:si s} ({first_s:si s})",
+        "columns in": "{resolve_s:si s}",
+        "loaded in": "{load_s:si s}",
         "traced in, prb steps": "{trace_in_prb_steps:.3g}",
     },
     "transport-time": SIZE
     | {
-        "T E": of("apply_s"),
-        "T' I": of("adjoint_s"),
-        "read by both": of("read", si, "B"),
-        "bandwidth": of("bandwidth", si, "B/s"),
+        "T E": "{apply_s:si s}",
+        "T' I": "{adjoint_s:si s}",
+        "read by both": "{read:si B}",
+        "bandwidth": "{bandwidth:si B/s}",
         "both over the floor": "{above_floor:.2f}",
-        "a step through T": of("step_s"),
-        "prb, 16 spp, a step": of("prb_step_s"),
+        "a step through T": "{step_s:si s}",
+        "prb, 16 spp, a step": "{prb_step_s:si s}",
         "over a step through T": "{prb_ratio:.3g}",
     },
     "quality": SUN | {"exact columns": "{columns}"} | ERROR,
     "quality-parts": SUN | {"path depth 2: region": "{part}", "pixels": "{seen}"} | ERROR,
     "equal-error": SUN
     | {
-        "T: error": of("rmse", percent),
-        "a step through T": of("step_s"),
-        "prb, 16 spp: error": of("prb_rmse", percent),
-        "a step of prb": of("prb_step_s"),
-        "prb needs, spp": of("prb_needs", si),
+        "T: error": "{rmse:.3g%}",
+        "a step through T": "{step_s:si s}",
+        "prb, 16 spp: error": "{prb_rmse:.3g%}",
+        "a step of prb": "{prb_step_s:si s}",
+        "prb needs, spp": "{prb_needs:si}",
         "times a step through T": "{equal_error:.0f}",
     },
     "error-time": {
         "samples a pixel": "{prb_samples}",
-        "T: a step": of("step_s"),
-        "RMSE": of("rmse", percent),
-        "without the reference's noise": of("corrected", percent),
-        "prb: a step": of("prb_step_s"),
-        "its RMSE without the noise": of("prb_rmse", percent),
+        "T: a step": "{step_s:si s}",
+        "RMSE": "{rmse:.3g%}",
+        "without the reference's noise": "{corrected:.3g%}",
+        "prb: a step": "{prb_step_s:si s}",
+        "its RMSE without the noise": "{prb_rmse:.3g%}",
     },
     "scaling": {"varied": "{variable}"}
     | SIZE
     | {
         "spp": "{spp}",
         "exact columns": "{columns}",
-        "traced in": of("again_s"),
-        "read by both": of("read", si, "B"),
-        "held": of("held", si, "B"),
-        "T E": of("apply_s"),
-        "T' I": of("adjoint_s"),
+        "traced in": "{again_s:si s}",
+        "read by both": "{read:si B}",
+        "held": "{held:si B}",
+        "T E": "{apply_s:si s}",
+        "T' I": "{adjoint_s:si s}",
     },
     "fits": {
         "map": "{map}",
@@ -147,7 +113,7 @@ COLUMNS = {
         "mean ratio": "{mean_ratio:.2f}",
         "with noise: mean, dB": "{noisy_mean:.1f}",
         "worst of 5, dB": "{noisy_worst:.1f}",
-        "fitted in": of("fitted_s"),
+        "fitted in": "{fitted_s:si s}",
     },
 }
 """Columns of each table: a table's name is that of its marker in docs/engine.md."""
@@ -192,7 +158,7 @@ def summary(rows: list[dict]) -> str:
     machines = {}
     for about in (row["machine"] for row in rows):
         versions = ", ".join(f"{name} {version}" for name, version in about["versions"].items())
-        where = f"{about['cpu']}, {about['threads']} threads, {si(about['memory_bytes'], 'B')} of memory"
+        where = f"{about['cpu']}, {about['threads']} threads, {about['memory_bytes']:si B} of memory"
         llvm = f"LLVM {about['llvm']['version']}"
         machines[f"{where}; {versions}, {llvm}; commit {about['commit']}."] = None
     fits = [row for row in rows if row["table"] == "fits"]

@@ -62,7 +62,7 @@ def piece(settings, folder, what: str, first: int, count: int, reader=None) -> d
 
         def read(name, data, index):
             (path := Path(work) / name).write_bytes(data)
-            return process.read(path, index, declared_bytes(data), limited=index != WHOLE)
+            return process.read(path, index, declared_bytes(data))
 
         for index in range(first, first + count):
             if process.process is None:  # a reader's first call takes memory that later ones do not

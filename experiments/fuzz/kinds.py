@@ -54,6 +54,12 @@ XML = damage.Grammar(
     ),
 )  # fmt: skip
 
+SENSOR = """<sensor type="perspective"><float name="fov" value="40"/>
+<transform name="to_world"><lookat origin="0,1,6" target="0,0,0" up="0,1,0"/></transform>
+<film type="hdrfilm"><integer name="width" value="8"/><integer name="height" value="6"/></film></sensor>"""
+SHAPES = {"features.0.weight": (4, 3, 3, 3), "features.0.bias": (4,), "alpha": (1, 8, 1, 1)}
+"""Names and shapes that a file of weights is to have."""
+
 
 class WrongError(Exception):
     """A reader returned something that it must not."""
@@ -101,10 +107,10 @@ def read_configuration(path: Path, index: int) -> None:
 
 def read_weights(path: Path, index: int) -> None:
     """Read as weights of a network."""
-    found = weights.read(path, whole.SHAPES, "the test", "nowhere")
+    found = weights.read(path, SHAPES, "the test", "nowhere")
     shapes = {name: values.shape for name, values in found.items()}
     finite = all(np.isfinite(values).all() for values in found.values())
-    _demand(shapes == whole.SHAPES and finite, f"shapes {shapes}")
+    _demand(shapes == SHAPES and finite, f"shapes {shapes}")
 
 
 def read_scene(path: Path, index: int) -> None:
@@ -125,7 +131,7 @@ def read_asset(path: Path, index: int) -> None:
         bitmap = f'<texture type="bitmap" name="reflectance">{named}</texture>'
         shape = f'<shape type="sphere"><bsdf type="diffuse">{bitmap}</bsdf></shape>'
     outer = path.with_name("outer.xml")
-    outer.write_text(f'<scene version="3.0.0">{whole.SENSOR}<emitter type="constant"/>{shape}</scene>')
+    outer.write_text(f'<scene version="3.0.0">{SENSOR}<emitter type="constant"/>{shape}</scene>')
     _load(path, outer)
 
 
@@ -165,31 +171,36 @@ damaged_configuration = partial(damage.of_text, grammar=TOML)
 damaged_scene = partial(damage.of_text, grammar=XML)
 
 
-def damaged_entry(data: bytes, rng: np.random.Generator) -> bytes:
-    """Change the arrays of a cache entry, and make the checksums right again."""
+def _arrays(data: bytes) -> dict[str, np.ndarray]:
     with np.load(io.BytesIO(data)) as stored:
-        arrays = {name: stored[name] for name in stored.files}
+        return dict(stored)
+
+
+def _archive(arrays: dict[str, np.ndarray]) -> bytes:
+    stream = io.BytesIO()
+    np.savez(stream, **arrays)
+    return stream.getvalue()
+
+
+def damaged_entry(data: bytes, rng: np.random.Generator) -> bytes:
+    """Change the arrays of a cache entry, under right checksums."""
+    arrays = _arrays(data)
     key = arrays.pop(array_cache.KEY)
-    out = io.BytesIO()
-    np.savez(out, **{array_cache.KEY: key}, **damage.of_arrays(arrays, rng))
-    return out.getvalue()
+    return _archive({array_cache.KEY: key} | damage.of_arrays(arrays, rng))
 
 
 def damaged_checkpoint(data: bytes, rng: np.random.Generator) -> bytes:
-    """Damage the bytes, or the arrays and the state of a checkpoint whose digest stays right."""
+    """Damage the bytes, or the arrays and the state of a checkpoint under right checksums."""
     if rng.random() < 0.5:
         return damage.of_bytes(data, rng)
-    with np.load(io.BytesIO(data)) as stored:
-        arrays = {name: stored[name] for name in stored.files}
+    arrays = _arrays(data)
     meta = json.loads(arrays.pop("meta").tobytes())
     if rng.random() < 0.3:
         values = (-1, 2**70, "2", None, [], {}, 0.5, 1e400, True, [5], [{}])
         meta["state"][str(rng.choice(list(meta["state"])))] = damage.one_of(values, rng)
     else:
         arrays = damage.of_arrays(arrays, rng)
-    out = io.BytesIO()
-    np.savez(out, meta=np.frombuffer(json.dumps(meta).encode(), np.uint8), **arrays)
-    return out.getvalue()
+    return _archive({"meta": np.frombuffer(json.dumps(meta).encode(), np.uint8)} | arrays)
 
 
 # ---- kinds -------------------------------------------------------------------------------------------------
@@ -208,12 +219,12 @@ class Kind(NamedTuple):
 
 
 KINDS = {
-    "map": Kind(whole.maps, read_map),
-    "painted": Kind(whole.painted_files, read_painted),
+    "map": Kind(partial(whole.stored, "map"), read_map),
+    "painted": Kind(partial(whole.stored, "painted"), read_painted),
     "toml": Kind(whole.toml_files, read_configuration, damaged_configuration),
-    "weights": Kind(whole.weight_files, read_weights),
-    "scene": Kind(lambda: {"written.xml": whole.SCENE.encode()}, read_scene, damaged_scene),
-    "asset": Kind(whole.asset_files, read_asset, one_in=10),
+    "weights": Kind(partial(whole.stored, "weights"), read_weights),
+    "scene": Kind(partial(whole.stored, "scene"), read_scene, damaged_scene),
+    "asset": Kind(partial(whole.stored, "asset"), read_asset, one_in=10),
     "entry": Kind(lambda: {"recording.arrays": whole.recording().read_bytes()}, read_entry, damaged_entry),
     "checkpoint": Kind(whole.checkpoint_files, read_checkpoint, damaged_checkpoint),
 }

@@ -22,9 +22,8 @@ from .kinds import WrongError
 MIB = 1 << 20
 MULTIPLE, ROOM = 8, 64 * MIB
 """Memory a reader may use: in units of the declared float32 image, and beyond that whatever the file says."""
-ADDRESS_ROOM = 512 * MIB
-"""Address space beyond the multiple: pools and stacks of threads take it, and do not touch it."""
-MOST_ADDRESS = 8192 * MIB
+MOST_ADDRESS = 16384 * MIB
+"""Address space of the process, so that no file takes the whole memory of the machine."""
 LONGEST_MESSAGE = 600
 ALLOCATOR = {"MALLOC_PERTURB_": "165", "MALLOC_MMAP_THRESHOLD_": "65536"}
 """Freed memory is overwritten, so that its use is seen; large blocks go back to the system at once."""
@@ -75,14 +74,14 @@ class Worker:
             self.printed.close()
             self.process = None
 
-    def read(self, path: Path, index: int, declared: int, limited: bool = True) -> dict:
+    def read(self, path: Path, index: int, declared: int) -> dict:
         """Have a file read; returns its ``outcome``, ``error`` and ``peak`` bytes of memory."""
         if self.process is None:
             self._start()
         seconds = cpu_limit(declared, self.seconds)
         wait = self.patience * seconds
         with contextlib.suppress(EOFError, ConnectionError):
-            self.connection.send((path, index, declared, seconds, limited))
+            self.connection.send((path, index, declared, seconds))
             if not self.connection.poll(wait):
                 self.stop()
                 return {"outcome": "hung", "error": f"no answer in {wait:.0f} s of wall time"}
@@ -106,6 +105,7 @@ def _serve(reader, connection, printed: str) -> None:
         os.dup2(file.fileno(), 1)
         os.dup2(file.fileno(), 2)
     faulthandler.enable(file=2)
+    resource.setrlimit(resource.RLIMIT_AS, (MOST_ADDRESS, MOST_ADDRESS))
     mi.set_variant("llvm_ad_rgb")
     mi.set_log_level(mi.LogLevel.Error)
     warnings.simplefilter("always")  # each is a line on a user's terminal
@@ -114,28 +114,21 @@ def _serve(reader, connection, printed: str) -> None:
         connection.send(_limited(reader, printed, *connection.recv()))
 
 
-def _limited(reader, printed, path, index, declared, seconds, limited) -> dict:
+def _limited(reader, printed, path, index, declared, seconds) -> dict:
     """Call a reader within its limits; returns how it went, with the ``peak`` of memory."""
     before = os.path.getsize(printed)
     Path("/proc/self/clear_refs").write_text("5")  # the peak is what is resident now
     start = _status("VmRSS")
-    room = min(ADDRESS_ROOM + MULTIPLE * declared, MOST_ADDRESS)
-    hard = resource.getrlimit(resource.RLIMIT_AS)[1]
-    if limited:
-        resource.setrlimit(resource.RLIMIT_AS, (_status("VmSize") + room, hard))
     signal.setitimer(signal.ITIMER_PROF, seconds)  # its default action ends the process
     try:
         answer = judged(reader, path, index)
     finally:
         signal.setitimer(signal.ITIMER_PROF, 0)
-        resource.setrlimit(resource.RLIMIT_AS, (hard, hard))
     sys.stdout.flush()
     answer["peak"] = _status("VmHWM") - start
     if answer["peak"] > ROOM + MULTIPLE * declared:
         error = f"{answer['peak'] >> 20} MiB for {declared} bytes declared"
         return answer | {"outcome": "memory", "error": error}
-    if "not enough memory" in answer.get("error", "") and room < MOST_ADDRESS:
-        return answer | {"outcome": "memory"}
     said = Path(printed).read_bytes()[before:]
     if said and answer["outcome"] in ("read", "refused"):
         return answer | {"outcome": "printed", "error": said[:500].decode(errors="replace")}

@@ -1,8 +1,4 @@
-"""Edit maps with several lights, rooms, a studio, a street at night: which of them moved, and which stayed.
-
-The maps of ENVEDIT_DATA/hdri and a room whose lamps are known: turned; painted on; of the room one lamp
-somewhere else, off, and one more, without a turn.
-"""
+"""Edit maps with several lights, rooms, a studio, a street at night: which moved, and which stayed."""
 
 import json
 import math

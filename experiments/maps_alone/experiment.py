@@ -1,6 +1,5 @@
 """Time the commands on a map alone, and their peak memory, on three public maps and on one of 8192 x 4096."""
 
-import json
 import os
 import subprocess
 import sys
@@ -10,7 +9,6 @@ import numpy as np
 
 import envedit
 from envedit.core import latlong
-from envedit.core.errors import EnveditError
 from envedit.images import images
 from experiments import puresky
 from experiments.harness import Done, Experiment, calling
@@ -69,12 +67,7 @@ def timed(settings, folder: Path, line: str, width: int | None) -> dict:
         del envmap
     command = [sys.executable, "-m", "envedit", *(part.format(**names) for part in line.split()), "--json"]
     environment = os.environ | {"PYTHONPATH": str(Path(envedit.__file__).parents[1])}
-    file = folder / "cost.json"
-    measuring = [sys.executable, "-S", cost.__file__, str(file), *command]
-    code = subprocess.run(measuring, cwd=folder, env=environment, stdout=subprocess.DEVNULL).returncode
-    if code:
-        raise EnveditError(f"envedit {line} ended with exit code {code}; see above in log.txt")
-    return json.loads(file.read_text())
+    return cost.measured(command, folder, cwd=folder, env=environment, stdout=subprocess.DEVNULL)
 
 
 def enlarged(file: str, to: Path, width: int) -> str:

@@ -1,9 +1,4 @@
-"""Edit many skies in many scenes, and measure whether the results still look like photographs of a sky.
-
-Every PureSky map, the maps with ground and the analytic sky, in five scenes, towards: the map turned by 60
-and 140 degrees; three other PureSky maps; of the analytic sky its sun at other elevations instead of other
-maps. With a turn of the sky allowed and without.
-"""
+"""Edit many skies in many scenes, and measure whether the results still look like photographs of a sky."""
 
 import hashlib
 import itertools

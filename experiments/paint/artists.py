@@ -27,11 +27,7 @@ EXPERIMENT = Experiment(
         "map": "{map}",
         "settled, s": "{settled_s:.0f}",
         "feasible known, s": "{solved_s:.0f}",
-        "saving, s": "{saved_s:.0f}",
-        "painted change reached": "{towards:.0%}",
-        "feasible": "{reachable:.0%}",
-        "mean change elsewhere": "{elsewhere:.3f}",
-        "saved from shown": "{differs:.4f}",
+        **figure10.FIGURES,
     },
     summary=Summary(
         {},
@@ -42,7 +38,7 @@ EXPERIMENT = Experiment(
             "saved from shown, at most": "{differs.max:.4f}",
         },
     ),
-    panels=figure10.saved_panels,
+    panels=figure10.panels,
     sheet=lambda case: "artists.jpg",
     alone=True,
 )

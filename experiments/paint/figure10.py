@@ -3,9 +3,9 @@
 The strokes are those of scenes/edits, drawn with the pointer and set with the page's sliders, so that they
 are as the page has them: ellipses lie straight, a tint is at most 1 (the rest of it goes into the amount),
 and corners beyond the picture lie on its border. A hand's pace: :data:`CORNER_S` a corner,
-:data:`SETTING_S` a tool, a shape or a slider. The case ``page`` is a picture of the page, with the outlines
-of strokes. Chromium is the file that the environment variable CHROMIUM names, one of the search path, or
-Playwright's.
+:data:`SETTING_S` a tool, a shape or a slider. ``page.png`` in the folder of an edit is a picture of the page,
+with the outlines of strokes. Chromium is the file that the environment variable CHROMIUM names, one of the
+search path, or Playwright's.
 """
 
 import contextlib
@@ -24,10 +24,10 @@ import numpy as np
 
 from envedit.core.color import tonemap
 from envedit.core.errors import InputError
-from envedit.images import images
 from envedit.sweep.process import CONFIG
 from experiments import puresky
 from experiments.harness import Done, Experiment, calling
+from experiments.painted_edits import experiment as painted_edits
 
 MAP = "kloofendal_48d_partly_cloudy"
 CORNER_S, SETTING_S = 0.4, 1.0
@@ -42,14 +42,6 @@ FEASIBLE, RENDERED = f"{STATUS}('% feasible')", f"{STATUS}('with 256 samples')"
 SETTLED = f"() => /how much of the target|% feasible/.test({TEXT})"
 DIFFERS = re.compile(r"differs from the one shown before by (\S+) of a display value")
 SAVED = "() => document.querySelector('[data-testid=message]').textContent.includes('Saved in')"
-TITLES = {
-    "move_shadow": "Moving the shadow",
-    "add_reflection": "Adding a reflection",
-    "add_shadow": "Adding a shadow",
-    "warmer": "Colour temperature",
-    "enhance_shadow": "Enhancing the shadow",
-    "blur_shadow": "Blurring the shadow",
-}
 
 
 def prepared(folder: Path) -> Path:
@@ -172,6 +164,7 @@ def edit(settings, folder, strokes) -> dict:
     """Paint an edit in the page and save it; returns seconds, the edit's figures and the strokes as saved."""
     work = prepared(folder)
     with opened(work) as (page, _):
+        # ---- Paint, and wait for what follows
         set_to(page, "exposure", 0)  # amounts of light are of what is shown as white
         began = time.perf_counter()
         for stroke in strokes:
@@ -181,75 +174,65 @@ def edit(settings, folder, strokes) -> dict:
         settled = time.perf_counter()
         page.wait_for_function(FEASIBLE, timeout=300_000)
         solved = time.perf_counter()
+
+        # ---- The picture of the page, path traced
+        page.wait_for_function(RENDERED, timeout=300_000)
+        choose(page, "outlines")
         page.screenshot(path=folder / "page.png")
+
+        # ---- Save
+        clicked = time.perf_counter()
         page.get_by_test_id("save").click()
         page.wait_for_function(SAVED, timeout=600_000)
         saved = time.perf_counter()
         message = page.get_by_test_id("message").inner_text()
     found = json.loads((work / "edit_out/metrics.json").read_text())["painted"]
     differs = DIFFERS.search(message)
-    found["differs"] = float(differs[1]) if differs else None
-    found["strokes"] = tomllib.loads((work / "edit_out/painted.toml").read_text())["target"]["strokes"]
-    seconds = {"painted": painted - began, "settled": settled - painted}
-    seconds |= {"solved": solved - painted, "saved": saved - solved}
-    return found | {f"{name}_s": value for name, value in seconds.items()}
-
-
-def picture(settings, folder, strokes) -> dict:
-    """Paint an edit and take the picture of the page, path traced, with the outlines of its strokes."""
-    with opened(prepared(folder)) as (page, _):
-        for stroke in strokes:
-            paint(page, stroke)
-        page.wait_for_function(FEASIBLE, timeout=300_000)
-        page.wait_for_function(RENDERED, timeout=300_000)
-        choose(page, "outlines")
-        page.screenshot(path=folder / "page.png")
-    return {}
+    return found | {
+        "differs": float(differs[1]) if differs else None,
+        "strokes": tomllib.loads((work / "edit_out/painted.toml").read_text())["target"]["strokes"],
+        "painted_s": painted - began,
+        "settled_s": settled - painted,
+        "solved_s": solved - painted,
+        "saved_s": saved - clicked,
+    }
 
 
 def cases(given):
     sky = puresky.file(MAP)
     found = []
-    for name, title in TITLES.items():
-        shipped = Path(__file__).parents[2] / "scenes/edits" / f"{name}.toml"
-        asked = tomllib.loads(shipped.read_text())
+    for name in painted_edits.EDITS:
+        asked = tomllib.loads((painted_edits.FOLDER / f"{name}.toml").read_text())
         tables = {"input": {"envmap": sky}, "scene": asked["scene"]}
-        strokes = asked["target"]["strokes"]
-        found.append(calling(name, edit, tables, {"edit": title}, strokes=strokes))
-        if name == "move_shadow":
-            page = calling("page", picture, tables, strokes=strokes)
-    return [*found, page]
+        found.append(calling(name, edit, tables, {"edit": name}, strokes=asked["target"]["strokes"]))
+    return found
 
 
-def saved_panels(done: Done) -> list[np.ndarray]:
+def panels(done: Done) -> list[np.ndarray]:
     """Return rendering before, painted and saved, and the map before and after."""
     saved = Done(done.case, done.folder / "work/edit_out")
     maps = [tonemap(one, "gamma") for one in saved.maps[:2]]
     return saved.shown("render_initial", "render_target", "render_edited") + maps
 
 
-def panels(done: Done) -> list[np.ndarray]:
-    """Return those of an edit with the upper halves of both maps in one; or the picture of the page."""
-    if done.case.name == "page":
-        return [images.read_stored(str(done.folder / "page.png"))[0][..., :3] / 255]
-    *renderings, before, after = saved_panels(done)
-    return [*renderings, np.concatenate([one[: len(one) // 2] for one in (before, after)])]
-
+FIGURES = {
+    "saving, s": "{saved_s:.0f}",
+    "painted change reached": "{towards:.0%}",
+    "feasible": "{reachable:.0%}",
+    "mean change elsewhere": "{elsewhere:.3f}",
+    "saved from shown": "{differs:.4f}",
+}
+"""Columns of every edit that is painted in the page."""
 
 EXPERIMENT = Experiment(
     cases,
-    lambda done: [] if done.case.name == "page" else done.metrics,
-    {
+    columns={
         "edit": "{edit}",
         "strokes": lambda row: ", ".join(f"{s['type']} ({shape_of(s) or 'all'})" for s in row["strokes"]),
         "painting + settling, s": "{painted_s:.0f} + {settled_s:.0f}",
-        "saving, s": "{saved_s:.0f}",
-        "painted change reached": "{towards:.0%}",
-        "feasible": "{reachable:.0%}",
-        "mean change elsewhere": "{elsewhere:.3f}",
-        "saved from shown": "{differs:.4f}",
+        **FIGURES,
     },
     panels=panels,
-    sheet=lambda case: "page" if case.name == "page" else "figure10",
+    sheet=lambda case: "figure10",
     alone=True,
 )

@@ -8,20 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.harness import Experiment, calling, done_of, figure
+from experiments.harness import Experiment, calling, figure
 from experiments.paint.figure10 import RENDERED, drag, opened, place, prepared
 
-BUTTONS = (
-    "undo",
-    "redo",
-    "add-light",
-    "light-mute",
-    "light-delete",
-    "region-remove",
-    "clear",
-    "shape-polygon",
-)
+BUTTONS = "button:visible:enabled:not(#save, #look, #light-image, .grip)"
+"""All but those that write or ask for a file, and those that are dragged."""
 KEYS = ("b", "1", "5", "[", "]", "Escape", "Enter", "Control+z", "ArrowLeft")
+LIGHTS = 0.75
+"""Share of the drags over the map that begin at a light."""
 MOVE_S = 0.03
 LONGEST_PAUSE_S = 2.0
 """Between two actions, so that some of them are solved for and others are superseded."""
@@ -42,45 +36,22 @@ def resident_mb(process) -> float:
     return int(found[1]) / 1024 if found else float("nan")
 
 
-def act(page, chance: random.Random) -> str:
-    """Do something at random; returns what."""
-    what = chance.choice(ACTIONS)
-    what(page, chance)
-    time.sleep(LONGEST_PAUSE_S * chance.random())
-    return what.__name__
-
-
-def stroke(page, chance):
-    """Paint with any tool and shape."""
-    for name in ("[data-tool]", "[data-shape]:visible"):
-        buttons = page.locator(name)
-        if buttons.count():
-            buttons.nth(chance.randrange(buttons.count())).click()
+def paint(page, chance):
+    """Drag over the picture, by the tool and shape that were chosen."""
     drag(page, spots(page, chance, "#overlay", chance.randrange(2, 12)), MOVE_S)
 
 
-def light(page, chance):
-    """Drag a light."""
-    seen = page.evaluate(SEEN_HANDLES)  # the map may be zoomed
-    if seen:
-        there = spots(page, chance, "#map-stack", chance.randrange(1, 12))
-        drag(page, [chance.choice(seen), *there], MOVE_S)
-
-
-def region(page, chance):
-    """Draw a region of the map."""
-    page.get_by_test_id("region").click()
-    kind = page.get_by_test_id("region-action")
-    if kind.is_visible():
-        kind.select_option(chance.choice(["keep", "scale", "fill"]))
-        drag(page, spots(page, chance, "#map-stack", chance.randrange(2, 6)), MOVE_S)
+def over_map(page, chance):
+    """Drag a light over the map, or from a place of it: then a region is painted, or the sky turned."""
+    seen = page.evaluate(SEEN_HANDLES) if chance.random() < LIGHTS else []  # the map may be zoomed
+    there = spots(page, chance, "#map-stack", chance.randrange(2, 12))
+    drag(page, [chance.choice(seen), *there] if seen else there, MOVE_S)
 
 
 def button(page, chance):
-    """Press a button that can be pressed."""
-    pressed = page.get_by_test_id(chance.choice(BUTTONS))
-    if pressed.is_visible() and pressed.is_enabled():
-        pressed.click()
+    """Press a button."""
+    buttons = page.locator(BUTTONS)
+    buttons.nth(chance.randrange(buttons.count())).click(force=True)
 
 
 def turn(page, chance):
@@ -107,7 +78,7 @@ def reload(page, chance):
     page.wait_for_selector(".handle", state="attached", timeout=120_000)
 
 
-ACTIONS = [stroke] * 6 + [light] * 3 + [button] * 3 + [region, turn, wheel, key, reload]
+ACTIONS = [paint] * 6 + [over_map] * 4 + [button] * 6 + [turn, wheel, key, reload]
 
 
 def spots(page, chance, name, count) -> list:
@@ -138,7 +109,10 @@ def soak(settings, folder, minutes) -> dict:
         began = time.monotonic()
         for half in (1, 2):
             while time.monotonic() < began + 30 * half * minutes and process.poll() is None:
-                done[act(page, chance)] += 1
+                action = chance.choice(ACTIONS)
+                action(page, chance)
+                time.sleep(LONGEST_PAUSE_S * chance.random())
+                done[action.__name__] += 1
                 memory.append([time.monotonic() - began, resident_mb(process)])
             rest.append(at_rest_mb(page, process))
         alive = process.poll() is None
@@ -176,10 +150,10 @@ def failures(rows) -> list[str]:
     return found
 
 
-def draw(cases, out, to, given):
+def draw(done, to):
     """Draw the server's memory over time: ``memory.png``."""
     with figure(to / "memory.png", 1, 1, (7, 2.8), squeeze=False) as panels:
-        for one in done_of(cases, out):
+        for one in done:
             seconds, memory = np.array(one.metrics["memory"]).T
             panels[0, 0].plot(seconds / 60, memory, linewidth=0.8)
         panels[0, 0].set(xlabel="minutes of random use", ylabel="memory of the server, MB", ylim=(0, None))

@@ -65,14 +65,14 @@ def share(settings, view: View, initial: np.ndarray, paint: Paint) -> float:
         picture=paint.picture,
     )
     other = transport.other_light()
+    size = np.bincount(overview.block_of)
+    painted = overview.to_blocks(coverage)[:, 0] * size / coverage.sum()
     comparison = _Comparison(
         parts=np.stack([overview.to_blocks(picture) for picture in pictures]),
         other=overview.to_blocks(other),
         aim=overview.to_blocks(paint.picture - initial + pictures.sum(axis=0) + other).clip(0),
-        painted=overview.to_blocks(coverage)[:, 0] / coverage.sum(),
-        error=ERROR * likelihood.paint_noise,
-        rest=overview.to_blocks(likelihood.share)[:, 0],
-        size=np.bincount(overview.block_of),
+        precision=painted / (ERROR * likelihood.paint_noise) ** 2,
+        rest=overview.to_blocks(likelihood.share)[:, 0] * size,
         white=likelihood.white,
     )
 
@@ -91,26 +91,22 @@ class _Comparison:
     """Blocks of pixels, by which lights are compared.
 
     ``parts`` (m, n, 3) are radiance under parts of the map, the first under all but its lights, ``other``
-    (n, 3) under other lamps, ``aim`` (n, 3) what is wanted. ``painted`` (n,) is how much of the paint is in a
-    pixel of a block, ``rest`` (n,) what it counts in the mean of what was not painted, ``size`` (n,) how many
-    pixels a block has.
+    (n, 3) under other lamps, ``aim`` (n, 3) what is wanted. ``precision`` (n,) is the inverse variance of
+    the paint in a block, ``rest`` (n,) what the block counts in the mean of what was not painted.
     """
 
     parts: np.ndarray
     other: np.ndarray
     aim: np.ndarray
-    painted: np.ndarray
-    error: float
+    precision: np.ndarray
     rest: np.ndarray
-    size: np.ndarray
     white: float
 
     def share(self, radiance):
         """Return the share of the paint that radiance (n, 3) has."""
         now = self.parts.sum(axis=0) + self.other
         left, asked = (
-            np.abs(tonemap(one) - tonemap(self.aim)).mean(axis=1) @ (self.painted * self.size)
-            for one in (radiance, now)
+            np.abs(tonemap(one) - tonemap(self.aim)).mean(axis=1) @ self.precision for one in (radiance, now)
         )
         return float(1 - left / asked)
 
@@ -162,18 +158,17 @@ class _Comparison:
 
     def _misfit(self, off):
         """Return what residuals (k, n) of display values count, (k,)."""
-        paint = off**2 @ (self.painted * self.size) / self.error**2
-        return paint + STATEMENTS * (off @ (self.rest * self.size)) ** 2
+        return off**2 @ self.precision + STATEMENTS * (off @ self.rest) ** 2
 
     def _normal(self, x, parts, radiance, shown):
         """Return half the Gauss-Newton Hessian and half the gradient of the misfit, (k, i, i) and (k, i)."""
         off = self._display(radiance) - shown
         slope = display_curve.slope(np.float32(radiance)[..., None], self.white)[..., 0]
         jacobian = np.exp(x)[..., None] * parts * slope[:, None]
-        weighted = jacobian * (self.painted * self.size / self.error**2)
-        mean = jacobian @ (self.rest * self.size)
+        weighted = jacobian * self.precision
+        mean = jacobian @ self.rest
         hessian = weighted @ jacobian.transpose(0, 2, 1) + STATEMENTS * mean[..., None] * mean[:, None]
-        pull = (off @ (self.rest * self.size))[:, None]
+        pull = (off @ self.rest)[:, None]
         return hessian, np.einsum("kin,kn->ki", weighted, off) + STATEMENTS * mean * pull
 
 

@@ -46,7 +46,7 @@ class View:
     """What the camera of a scene with one view sees, by a ray through the middle of each pixel."""
 
     scene: Scene
-    envmap: np.ndarray  # (H, W, 3), the map that lights it
+    envmap: np.ndarray | None = None  # (H, W, 3), the map that lights it
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -107,11 +107,15 @@ class View:
         """All other pixels that see a surface, bool (h, w)."""
         return self.surface & ~self.floor
 
-    def shadow(self, direction: np.ndarray) -> np.ndarray | None:
-        """Return where a direction of the map is blocked on the floor; None if that is too small an area."""
+    def blocked(self, direction: np.ndarray) -> np.ndarray:
+        """Return where a direction of the map is blocked on the floor, bool (h, w)."""
         world = self.scene.to_world @ direction
         blocked = self.scene.mi.ray_test(self._hit.spawn_ray(mi.Vector3f(*world.tolist())))
-        shaded = np.array(blocked).reshape(self.shape) & self.floor
+        return np.array(blocked).reshape(self.shape) & self.floor
+
+    def shadow(self, direction: np.ndarray) -> np.ndarray | None:
+        """Return where a direction of the map is blocked on the floor; None if that is too small an area."""
+        shaded = self.blocked(direction)
         return shaded if shaded.mean() >= LEAST_AREA else None
 
     def blurred(self, values: np.ndarray, deviation: float) -> np.ndarray:

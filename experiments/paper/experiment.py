@@ -5,6 +5,7 @@ Tables share the runs that they have in common.
 
 from __future__ import annotations
 
+import csv
 import itertools
 import json
 import tomllib
@@ -20,9 +21,17 @@ from experiments.harness import Case, Done, Experiment
 from experiments.painted_edits import experiment as painted_edits
 from experiments.summary import Summary
 
-from .methods import METHODS, ONLY_OURS, PAINTED
-from .published import PUBLISHED
-
+FOLDER = Path(__file__).parent
+METHODS = tomllib.loads((FOLDER / "methods.toml").read_text())
+"""Rows of all tables: ``title``, tables of a ``run``, and more tables under the ``paper``'s settings."""
+PAINTED = ("none", "lum-l1", "lum-l1-dists", "layers-painted")
+"""Those of Figure 9."""
+ROWS = tuple(name for name in METHODS if name not in PAINTED)
+ONLY_OURS = ("r-siren-own", "layers", "layers-painted")
+"""Rows that the paper's settings do not have."""
+PRESETS = {"paper": "paper", "ours": "standard"}
+"""Preset of either settings: Sec. 6 to the letter, with fresh samples of a path tracer at every step; the
+stored transport, and losses on pictures beside the SSIM."""
 DEGREES = 60.0
 """Turn of the true map to the left."""
 DEFAULT = "kloofendal_48d_partly_cloudy"
@@ -35,18 +44,18 @@ OTHER = "autumn_field"
 class Kind:
     """One table or figure."""
 
-    rows: tuple[str, ...]  # of METHODS or PAINTED, in the order in which they are shown
+    rows: tuple[str, ...]  # of METHODS, in the order in which they are shown
     scene: str  # shipped scene; "" for a painted edit, which has its own
     roughness: tuple[float | None, ...] = (None,)  # values of its parameter; None: as the scene has it
     several: bool = False  # averaged over all maps; else of one, unless --all-maps is given
 
 
 KINDS = {
-    "table1": Kind(tuple(METHODS), "statue"),
-    "table2": Kind(tuple(METHODS), "mirror"),
-    "table3": Kind(tuple(METHODS), "statue", (0.0, 0.5, 1.0), several=True),
+    "table1": Kind(ROWS, "statue"),
+    "table2": Kind(ROWS, "mirror"),
+    "table3": Kind(ROWS, "statue", (0.0, 0.5, 1.0), several=True),
     "figure8": Kind(("r-siren-reg", "layers"), "statue", (0.0, 0.5, 1.0)),
-    "figure9": Kind(tuple(PAINTED), ""),
+    "figure9": Kind(PAINTED, ""),
 }
 
 
@@ -79,8 +88,16 @@ def cases(args):
         question = presets.overlaid(asked(args, kind, roughness), {"input": {"envmap": str(maps[sky])}})
         about = {"table": args.name, "settings": settings, "row": row, "map": sky, "roughness": roughness}
         name = f"{settings}-{row}-{sky}" + ("" if roughness is None else f"-{roughness:.1f}")
-        made.append(Case(name, presets.overlaid((METHODS | PAINTED)[row].under(settings), question), about))
+        made.append(Case(name, presets.overlaid(under(settings, row), question), about))
     return made
+
+
+def under(settings: str, row: str) -> dict:
+    """Return the tables of a method under the settings "paper" or "ours"."""
+    # The paper's task: the upper rows of a turned map, for models that cannot turn it.
+    task = {"preset": PRESETS[settings], "input": {"rows": "upper"}, "representation": {"turn": False}}
+    tables = presets.overlaid(task, METHODS[row]["run"])
+    return presets.overlaid(tables, METHODS[row].get("paper", {})) if settings == "paper" else tables
 
 
 def asked(args, kind: Kind, roughness: float | None) -> dict:
@@ -104,7 +121,7 @@ def asked(args, kind: Kind, roughness: float | None) -> dict:
 
 def measure(done: Done) -> list[dict]:
     """Return rows: before the edit; what the true map itself scores, rendered twice; the edit."""
-    title = (METHODS | PAINTED)[done.case.about["row"]].title
+    title = METHODS[done.case.about["row"]]["title"]
     edited = {**done.metrics, "title": title, **seconds(done)}
     if done.case.about["row"] in PAINTED:
         return [edited]
@@ -130,11 +147,16 @@ def seconds(done: Done) -> dict[str, float | None]:
 
 
 def published(table: str, roughness: float | None) -> list[dict]:
-    """Return the numbers that the paper printed, a row for each method."""
-    return [
-        {"title": f"{METHODS[name].title}, published", **numbers}
-        for name, numbers in PUBLISHED.get(table, {}).get(roughness, {}).items()
-    ]
+    """Return the numbers that the paper printed, a row for each method; PSNR in dB."""
+    rows = []
+    for line in csv.DictReader((FOLDER / "published.csv").read_text().splitlines()):
+        if (line["table"], line["roughness"]) == (table, "" if roughness is None else f"{roughness:.1f}"):
+            numbers = {
+                image: {metric: float(line[f"{image} {metric}"]) for metric in FORMS}
+                for image in ("envmap", "render")
+            }
+            rows.append({"title": f"{METHODS[line['row']]['title']}, published", **numbers})
+    return rows
 
 
 def summary(rows: list[dict]) -> str:
@@ -182,5 +204,4 @@ EXPERIMENT = Experiment(
     summary=summary,
     sheet=lambda case: "{table}-{settings}-{roughness}".format(**case.about).removesuffix("-None"),
     options=options,
-    file=lambda args: args.name,
 )

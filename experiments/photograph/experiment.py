@@ -1,7 +1,4 @@
-"""Edit towards photographs of unknown cameras, and towards the same pictures given linear.
-
-The photographs are path traced under another map than the one that is edited (:mod:`.cameras`).
-"""
+"""Edit towards photographs of unknown cameras, and towards the same pictures given linear."""
 
 import itertools
 from dataclasses import dataclass, replace

@@ -17,9 +17,9 @@ import mitsuba as mi
 import numpy as np
 
 import envedit
+from envedit.core import latlong
 from envedit.core.atomic_files import make_folder
 from envedit.core.color import tonemap
-from envedit.core.resampling import fit
 from envedit.images import images
 from envedit.results import Result
 from experiments import puresky
@@ -33,10 +33,6 @@ SIZES = {"coffee": (150, 100), "astronaut": (96, 96)}
 """Width and height of the renderings."""
 HORIZON = {"coffee": "auto", "astronaut": "free"}
 """A table hides the light from below; without one, lights at any height move whole."""
-LEFT_OUT = {"coffee": [], "astronaut": [(0, 512, 0, 75), (0, 270, 350, 480), (270, 512, 360, 512)]}
-"""Rows and columns of what the scene lacks, pixels of the photograph: flag, model, table."""
-VISOR = 452, 393, 100
-"""Row, column and radius of what counts although it is in them, pixels: the black of the helmet."""
 SIDES = 48
 PROFILES = {
     "ball": [(np.cos(v), np.sin(v)) for v in np.linspace(-1.57, 1.57, 24)],
@@ -54,8 +50,6 @@ PROFILES = {
 }
 """Radius and height of points on surfaces of revolution, so that their front is on the right upwards."""
 INSERTED = insertion.ball(x=1.1, z=-0.55, radius=0.2, colour="0.05, 0.25, 0.3", alpha=0.05)
-PANEL = 225
-"""Height of the rows of the contact sheet, pixels."""
 
 
 def main() -> None:
@@ -76,28 +70,21 @@ def draw(folder: Path) -> None:
     for name in SIZES:
         edited_map = images.read(folder / name / "edited.exr")[0]
         pictures = [images.read_stored(folder / name / "photograph.png")[0] / 255]
-        pictures += [tonemap(one / 4, "gamma") for one in (studio, edited_map)]
+        pictures += [tonemap(latlong.resize(one, 200, 400) / 4, "gamma") for one in (studio, edited_map)]
         if name == "coffee":
             pictures.append(images.read_stored(folder / "inserted.png")[0] / 255)
-        rows.append([scaled(one) for one in pictures])
+        rows.append(pictures)
     mi.Bitmap(montage(rows)).write(str(folder / "sheet.jpg"), quality=85)
 
 
 def prepare(folder: Path) -> None:
-    """Write photographs, masks, scenes and meshes."""
+    """Write photographs, scenes and meshes."""
     command = ["pip", "download", "-q", "--no-deps", "--only-binary", ":all:", "-d", str(folder), WHEEL]
     subprocess.run([sys.executable, "-m", *command], check=True)
     with zipfile.ZipFile(next(folder.glob("scikit_image-*.whl"))) as wheel:
         for name in SIZES:
             (folder / f"{name}.png").write_bytes(wheel.read(f"skimage/data/{name}.png"))
-            shutil.copy(SCENES / f"{name}.xml", folder)
-            mask = np.ones_like(images.read_stored(folder / f"{name}.png")[0][..., :3])
-            for top, bottom, left, right in LEFT_OUT[name]:
-                mask[top:bottom, left:right] = 0
-            if name == "astronaut":
-                row, column = np.mgrid[: len(mask), : len(mask)]
-                mask[np.hypot(row - VISOR[0], column - VISOR[1]) < VISOR[2]] = 1
-            images.write_png(folder / f"{name}_mask.png", mask)
+    shutil.copytree(SCENES, folder, dirs_exist_ok=True)
     angles = 2 * np.pi * np.arange(SIDES) / SIDES
     for name, profile in PROFILES.items():
         lines = [
@@ -118,12 +105,10 @@ def edited(name: str, folder: Path) -> Result:
     settings = {
         "input": {"envmap": str(puresky.data(STUDIO) / STUDIO), "width": 128, "horizon": HORIZON[name]},
         "scene": {"file": str(folder / f"{name}.xml"), "width": width, "height": height},
-        "target": {
-            "kind": "photo",
-            "file": str(folder / f"{name}.png"),
-            "mask": str(folder / f"{name}_mask.png"),
-        },
+        "target": {"kind": "photo", "file": str(folder / f"{name}.png")},
     }
+    if name == "astronaut":  # the scene lacks flag, model and table
+        settings["target"]["mask"] = str(folder / "astronaut_mask.png")
     result = envedit.edit(settings)
     result.save(folder / name)
     print(f"{name}: {result.photo.summary}, {result.metrics['timing']['total_s']:.0f} s")
@@ -143,15 +128,6 @@ def insert_ball(result: Result, folder: Path) -> None:
     outline = scenes["alone"].alpha[..., None]
     shown = photo.camera.shown(insertion.composed(photo.picture, outline, with_object, without))
     images.write_png(folder / "inserted.png", shown)
-
-
-def scaled(picture: np.ndarray) -> np.ndarray:
-    """Return a picture of :data:`PANEL` rows."""
-    height, width = picture.shape[:2]
-    if height < PANEL:
-        factor = -(-PANEL // height)
-        picture = picture.repeat(factor, axis=0).repeat(factor, axis=1)
-    return fit(picture, PANEL, round(width * PANEL / height))
 
 
 if __name__ == "__main__":

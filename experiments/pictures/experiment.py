@@ -1,8 +1,4 @@
-"""Edit towards the same light given as a map, as a linear picture, and as an 8-bit picture of plain Mitsuba.
-
-Each case is three edits: the target is the map; the picture that envedit renders under it; an sRGB PNG that
-Mitsuba renders of the scene as its author has it, with its filter and other samples.
-"""
+"""Edit towards the same light given as a map, a linear picture, and an 8-bit picture of plain Mitsuba."""
 
 import itertools
 from dataclasses import replace

@@ -6,15 +6,23 @@ those of the same call. Nothing else should run on the machine meanwhile.
 
 from __future__ import annotations
 
-import math
+import itertools
 import statistics
 
+from experiments import puresky
 from experiments.harness import Done, Experiment, calling
-from experiments.summary import Numbers, Value
+from experiments.summary import Summary
 
-from . import plan
 from .cell import cell
 
+MAPS = ("overcast_soil", "wasteland_clouds", "kloofendal_48d_partly_cloudy")
+"""Overcast, in between, and sunny: peaks of 4.5, 309 and 8,963 at 256 texels across."""
+SCENES = {
+    "matte": {"file": "matte"},
+    "glossy": {"file": "sphere", "parameters": {"roughness": 0.05}},
+}
+STANDARD = "standard, seed "
+"""Begin of the names of the runs of the standard preset."""
 MOST_PSNR = 55.0
 """Most dB of a rendering that are shown: beyond, the estimate without noise may itself be noise (57 dB for
 the true map, where the judge has most of it)."""
@@ -26,11 +34,29 @@ PARTS = {
 """Seconds of a run by part, as ``--budget`` reckons with them, and the timings that each is the sum of."""
 
 
+def base(file: str, scene: str) -> dict:
+    """Return the configuration of the standard preset with a map's file, in one of :data:`SCENES`.
+
+    Fits and transports are not kept on disk, so that every run pays for its own.
+    """
+    return {
+        "input": {"envmap": file},
+        "scene": SCENES[scene],
+        "target": {"rotate_degrees": 60},
+        # Where the sky turned, every setting would find the same map.
+        "representation": {"turn": False},
+        "renderer": {"cache": False},
+        "fit": {"cache": False},
+    }
+
+
 def cases(given):
-    return [
-        calling(f"{name}, {scene}", cell, tables, {"cell": f"{name}, {scene}"}, scene=scene, sets=given.sets)
-        for (name, scene), tables in plan.cells().items()
-    ]
+    made = []
+    for name, scene in itertools.product(MAPS, SCENES):
+        title = f"{name}, {scene}"
+        standard = base(puresky.file(name), scene)
+        made.append(calling(title, cell, standard, {"cell": title}, standard=standard, sets=given.sets))
+    return made
 
 
 def worth(judged: dict) -> dict:
@@ -66,7 +92,7 @@ def measure(done: Done) -> list[dict]:
     the target, which both share, is the largest difference under a sun (6 dB between seeds).
     """
     rows = [{"setting": run["setting"]} | costs(run) | worth(run["judged"]) for run in done.metrics["runs"]]
-    standard = [row for row in rows if row["setting"] in plan.STANDARD]
+    standard = [row for row in rows if row["setting"].startswith(STANDARD)]
     for row in rows:
         for ratio, key in {"time": "s", "again": "again_s", "memory": "gb"}.items():
             row[ratio] = row[key] / statistics.median(one[key] for one in standard)
@@ -78,49 +104,35 @@ def measure(done: Done) -> list[dict]:
     return rows
 
 
-def means(rows: list[dict]) -> list[dict]:
-    """Average every setting over its cells: ratios geometrically, differences arithmetically."""
-    found = []
-    for setting in dict.fromkeys(row["setting"] for row in rows):
-        some = [row for row in rows if row["setting"] == setting]
-        logs = {key: Numbers([math.log(row[key]) for row in some]) for key in ("time", "again", "memory")}
-        mean = {key: Numbers([row[key] for row in some]).mean for key in ("rendering", "map", "ssim", "sun")}
-        mean |= {key: Value(math.exp(one.mean)) for key, one in logs.items()}
-        found.append({"table": "settings", "setting": setting, "cells": len(some)} | mean)
-    return found
-
-
 EXPERIMENT = Experiment(
     cases,
     measure,
     {
-        "settings": {
-            "setting": "{setting}",
-            "cells": "{cells}",
-            "time": "{time:.2f}",
-            "again": "{again:.2f}",
-            "memory": "{memory:.2f}",
-            "rendering, dB": "{rendering:+.2f}",
-            "map, dB": "{map:+.2f}",
-            "map SSIM": "{ssim:+.3f}",
-            "sun off, degrees": "{sun:.1f}",
-        },
-        "runs": {
-            "cell": "{cell}",
-            "setting": "{setting}",
-            "s": "{s:.1f}",
-            "s again": "{again_s:.1f}",
-            "rendering s": "{rendering_s:.1f}",
-            "tracing and search s": "{tracing_s:.1f}",
-            "numbers s": "{numbers_s:.1f}",
-            "GB": "{gb:.2f}",
-            "rendering, dB": "{psnr:.1f}",
-            "map, dB": "{map_psnr:.1f}",
-            "map SSIM": "{map_ssim:.3f}",
-            "sun off, degrees": "{sun:.1f}",
-        },
+        "cell": "{cell}",
+        "setting": "{setting}",
+        "s": "{s:.1f}",
+        "s again": "{again_s:.1f}",
+        "rendering s": "{rendering_s:.1f}",
+        "tracing and search s": "{tracing_s:.1f}",
+        "numbers s": "{numbers_s:.1f}",
+        "GB": "{gb:.2f}",
+        "rendering, dB": "{psnr:.1f}",
+        "map, dB": "{map_psnr:.1f}",
+        "map SSIM": "{map_ssim:.3f}",
+        "sun off, degrees": "{sun:.1f}",
     },
-    group=lambda row: row["table"],
-    combine=lambda rows: means(rows) + [row | {"table": "runs"} for row in rows],
+    summary=Summary(
+        {"setting": "{setting}"},
+        {
+            "cells": "{runs}",
+            "time": "{time.geometric:.2f}",
+            "again": "{again.geometric:.2f}",
+            "memory": "{memory.geometric:.2f}",
+            "rendering, dB": "{rendering.mean:+.2f}",
+            "map, dB": "{map.mean:+.2f}",
+            "map SSIM": "{ssim.mean:+.3f}",
+            "sun off, degrees": "{sun.mean:.1f}",
+        },
+    ),
     alone=True,
 )

@@ -13,7 +13,9 @@ from envedit.core.color import linear_to_srgb, luminance, srgb_to_linear
 from envedit.images import images
 from envedit.representations.layers.clipped_light import CORE_DEGREES
 from envedit.representations.layers.separation import separate
+from envedit.scene import scene
 from experiments.measures import degrees, irradiance
+from experiments.painted_edits.painters import View
 
 KEPT = ("evening_road_01", "kloppenheim_06", "rustig_koppie", "syferfontein_18d_clear")
 """Maps that no choice and no constant has seen: every third by name."""
@@ -26,7 +28,23 @@ is then 0.58 of the display's range."""
 SUNNY = 1 / 8
 """Flux of the sun over the sky's horizontal irradiance from which on a map is sunny: with less, its
 shadows are hardly seen."""
-PIXELS = (96, 72)
+SPHERE_ON_FLOOR = {
+    "type": "scene",
+    "integrator": {"type": "path", "max_depth": 3},
+    "sensor": {
+        "type": "perspective",
+        "fov": 40,
+        "to_world": mi.scalar_rgb.ScalarTransform4f().look_at([0, 6, 5], [0, 0, 0], [0, 1, 0]),
+        "film": {"type": "hdrfilm", "width": 96, "height": 72, "rfilter": {"type": "box"}},
+    },
+    "floor": {
+        "type": "rectangle",
+        "to_world": mi.scalar_rgb.ScalarTransform4f().rotate([1, 0, 0], -90).scale(30),
+        "bsdf": {"type": "diffuse", "reflectance": 0.5},
+    },
+    "sphere": {"type": "sphere", "center": [0, 0.7, 0], "radius": 0.7},
+    "light": {"type": "constant"},
+}
 SAMPLES = 256
 
 
@@ -59,7 +77,7 @@ def clipped(radiance: np.ndarray, level: str) -> tuple[np.ndarray, float]:
     return srgb_to_linear(codes / 255).astype(np.float32), exposure
 
 
-def truth(radiance: np.ndarray, name: str) -> Truth:
+def truth(radiance: np.ndarray) -> Truth:
     """Measure the sun of an unclipped map: the core of the light of :func:`.separate` with most flux.
 
     Where there is no light above the horizon, what is around the brightest texel.
@@ -84,8 +102,7 @@ def truth(radiance: np.ndarray, name: str) -> Truth:
     core = angle < CORE_DEGREES
     flux = float((np.maximum(lum - np.median(lum[around]), 0) * omega)[core].sum())
     sky = float((lum * omega * np.maximum(directions[..., 1], 0))[~core].sum())
-    sunny = name not in ROOMS and bool(lights) and flux > SUNNY * sky
-    return Truth(direction, flux, sky, sunny)
+    return Truth(direction, flux, sky, bool(lights) and flux > SUNNY * sky)
 
 
 def horizontal(radiance: np.ndarray) -> float:
@@ -97,40 +114,14 @@ class Shadow:
     """A sphere on a floor, seen from above: renderings, and the contrast of the true sun's shadow in them."""
 
     def __init__(self, direction: np.ndarray):
-        columns, rows = PIXELS
-        self._parts = {
-            "type": "scene",
-            "integrator": {"type": "path", "max_depth": 3},
-            "sensor": {
-                "type": "perspective",
-                "fov": 40,
-                "to_world": mi.ScalarTransform4f().look_at([0, 6, 5], [0, 0, 0], [0, 1, 0]),
-                "film": {"type": "hdrfilm", "width": columns, "height": rows, "rfilter": {"type": "box"}},
-            },
-            "floor": {
-                "type": "rectangle",
-                "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], -90).scale(30),
-                "bsdf": {"type": "diffuse", "reflectance": 0.5},
-            },
-            "sphere": {"type": "sphere", "center": [0, 0.7, 0], "radius": 0.7},
-        }
-        scene = mi.load_dict(self._parts)
-        v, u = np.meshgrid(
-            (np.arange(rows) + 0.5) / rows, (np.arange(columns) + 0.5) / columns, indexing="ij"
-        )
-        pixel = mi.Point2f(u.ravel().astype(np.float32), v.ravel().astype(np.float32))
-        ray, _ = scene.sensors()[0].sample_ray(0.0, 0.0, pixel, mi.Point2f(0.5))
-        hit = scene.ray_intersect(ray)
-        floor = np.array(hit.p)[1] < 1e-3
-        blocked = np.array(scene.ray_test(hit.spawn_ray(mi.Vector3f(*direction.tolist()))))
-        self._shadow = (floor & blocked).reshape(rows, columns)
-        self._open = (floor & ~blocked).reshape(rows, columns)
+        self._scene = scene.load(SPHERE_ON_FLOOR)
+        view = View(self._scene)
+        self._shadow = view.blocked(direction)
+        self._open = view.floor & ~self._shadow
 
     def render(self, radiance: np.ndarray) -> np.ndarray:
         """Return the picture (h, w, 3) under a map."""
-        bitmap = mi.Bitmap(np.ascontiguousarray(radiance, np.float32))
-        scene = mi.load_dict(self._parts | {"light": {"type": "envmap", "bitmap": bitmap}})
-        return np.array(mi.render(scene, spp=SAMPLES, seed=0))[..., :3]
+        return self._scene.render(radiance, SAMPLES)
 
     def contrast(self, picture: np.ndarray) -> float:
         """Return 1 less the light in the true sun's shadow over that on the open floor."""

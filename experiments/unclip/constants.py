@@ -11,7 +11,7 @@ from envedit.core.color import luminance
 from envedit.representations.layers import unclip
 from envedit.representations.layers.clipped_light import RING_DEGREES
 from experiments import puresky
-from experiments.harness import Experiment, calling
+from experiments.harness import Experiment
 from experiments.measures import degrees
 from experiments.summary import Summary
 from experiments.unclip import clipping
@@ -20,10 +20,10 @@ CLEAR = ("autumn_field", "kloofendal_48d_partly_cloudy", "sunflowers")
 LOW = ("industrial_sunset", "wasteland_clouds")
 
 
-def measure_sun(settings, folder, file: str, map_name: str) -> dict:
+def measure_sun(settings, folder, file: str) -> dict:
     """Return log2 of aureole over flux (1/sr), of flux over sky, of the analytic one, and of their ratio."""
     radiance = clipping.load(file)
-    true = clipping.truth(radiance, map_name)
+    true = clipping.truth(radiance)
     directions = latlong.directions(*radiance.shape[:2])
     angle = degrees(directions, true.direction)
     lum = luminance(radiance)
@@ -39,10 +39,7 @@ def measure_sun(settings, folder, file: str, map_name: str) -> dict:
 
 
 def cases(args):
-    maps = {name: str(file) for name, file in puresky.find().items() if name in CLEAR + LOW}
-    return [
-        calling(name, measure_sun, {}, {"map": name}, file=file, map_name=name) for name, file in maps.items()
-    ]
+    return [case for case in puresky.cases(measure_sun) if case.name in CLEAR + LOW]
 
 
 def constants(suns: list[dict]) -> tuple[np.ndarray, float, tuple[float, float]]:

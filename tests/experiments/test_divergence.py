@@ -1,7 +1,6 @@
 """An environment map by Adam on its texels: what the losses of path tracing and of stored transport are."""
 
 import math
-from types import SimpleNamespace
 
 import mitsuba as mi
 import numpy as np
@@ -26,7 +25,7 @@ def small(monkeypatch):
     return config.from_dict(tables)
 
 
-def test_transport_has_no_noise_and_path_tracing_has(small, tmp_path, monkeypatch):
+def test_transport_has_no_noise_and_path_tracing_has(small, tmp_path):
     done = []
     for name, how in {"traced": {"spp": 1, "least": 1.05}, "stored": {"spp": 0}}.items():
         folder = tmp_path / name
@@ -45,8 +44,7 @@ def test_transport_has_no_noise_and_path_tracing_has(small, tmp_path, monkeypatc
 
     rows = [divergence.measure(one) | one.case.about for one in done]
     assert table(divergence.EXPERIMENT, rows).count("\n") == 3
-    monkeypatch.setattr(divergence, "done_of", lambda made, out: done)
-    (drawn,) = divergence.draw([], tmp_path, tmp_path, SimpleNamespace())
+    (drawn,) = divergence.draw(done, tmp_path)
     assert drawn.stat().st_size > 1000
 
 

@@ -11,18 +11,21 @@ import pytest
 
 from envedit import config
 from envedit.core import latlong
+from envedit.core.errors import EnveditError
 from envedit.images import images
 from envedit.losses import metrics
 from envedit.sweep import DONE
 from experiments.__main__ import main
 from experiments.harness import Case
-from experiments.tradeoff import cell, cost, experiment, plan
+from experiments.tradeoff import cell, cost, experiment
 from experiments.tradeoff.judge import Judge, without_noise
+
+STANDARD = [f"{experiment.STANDARD}{seed}" for seed in range(3)]
 
 
 # ---- what is run -------------------------------------------------------------------------------------------
 def toml_of(tables):
-    return Case("x", config.presets.overlaid(plan.base("sky.hdr", "glossy"), tables)).job().toml
+    return Case("x", config.presets.overlaid(experiment.base("sky.hdr", "glossy"), tables)).job().toml
 
 
 def flat(tables):
@@ -32,7 +35,7 @@ def flat(tables):
 
 def test_a_setting_changes_what_it_says_and_nothing_else():
     standard, changed = flat({}), {}
-    for name, tables in plan.SETTINGS.items():
+    for name, tables in cell.SETTINGS.items():
         if ": " not in name:
             continue
         found = {k: v for k, v in flat(tables).items() if v != standard[k]}
@@ -46,11 +49,9 @@ def test_a_setting_changes_what_it_says_and_nothing_else():
 
 
 def test_the_standard_preset_runs_before_amid_and_after():
-    settings = plan.settings()
-    names = list(settings)
-    assert len(names) == 3 + len(plan.SETTINGS)
-    assert [names[i] for i in (0, 1 + len(plan.SETTINGS) // 2, -1)] == plan.STANDARD
-    seeds = [config.loads(toml_of(settings[name])).seed for name in (*plan.STANDARD, "draft")]
+    names = list(cell.SETTINGS)
+    assert [names[i] for i in (0, len(names) // 2, -1)] == STANDARD
+    seeds = [config.loads(toml_of(cell.SETTINGS[name])).seed for name in (*STANDARD, "draft")]
     assert seeds == [0, 1, 2, 0]
 
 
@@ -81,9 +82,10 @@ def test_all_runs_of_a_cell_are_made_in_turn(tmp_path, monkeypatch):
     made = []
     monkeypatch.setattr(cell, "carry_out", lambda folder: made.append(folder.name) or {"wall_s": len(made)})
     monkeypatch.setattr(cell, "Judge", FakeJudge)
-    settings = config.from_dict(plan.base("sky.hdr", "matte"), tmp_path)
-    found = cell.cell(settings, tmp_path, "matte", ["optimizer.iterations=7"])
-    assert made == [run["setting"] for run in found["runs"]] == list(plan.settings())
+    standard = experiment.base(str(tmp_path / "sky.hdr"), "matte")
+    settings = config.from_dict(standard)
+    found = cell.cell(settings, tmp_path, standard, ["optimizer.iterations=7"])
+    assert made == [run["setting"] for run in found["runs"]] == list(cell.SETTINGS)
     assert [run["cost"]["wall_s"] for run in found["runs"]] == list(range(1, len(made) + 1))
     psnr = {run["setting"]: run["judged"]["render"]["psnr_without_noise"] for run in found["runs"]}
     assert psnr["map width: 64"] == 31 and psnr["standard, seed 1"] == 34
@@ -94,38 +96,28 @@ def test_all_runs_of_a_cell_are_made_in_turn(tmp_path, monkeypatch):
 
 # ---- a run, measured ---------------------------------------------------------------------------------------
 def measured(folder, text):
-    file = folder / "cost.json"
-    command = [sys.executable, "-S", cost.__file__, file, sys.executable, "-S", "-c", text]
-    return cell.subprocess.run(command).returncode, json.loads(file.read_text())
+    return cost.measured([sys.executable, "-S", "-c", text], folder)
 
 
 @pytest.mark.slow
 def test_cost_is_that_of_the_process(tmp_path):
     here = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss >> 10
-    code, small = measured(tmp_path, "pass")
-    assert code == 0 and small["peak_bytes"] < 64 << 20 and small["peak_bytes"] >> 20 < here
-    code, large = measured(tmp_path, "a = bytearray(200 << 20); a[::4096] = b'1' * len(a[::4096])")
-    assert code == 0 and 200 << 20 < large["peak_bytes"] < 240 << 20
-    code, slow = measured(tmp_path, "import time; time.sleep(0.3)")
+    small = measured(tmp_path, "pass")
+    assert small["peak_bytes"] < 64 << 20 and small["peak_bytes"] >> 20 < here
+    large = measured(tmp_path, "a = bytearray(200 << 20); a[::4096] = b'1' * len(a[::4096])")
+    assert 200 << 20 < large["peak_bytes"] < 240 << 20
+    slow = measured(tmp_path, "import time; time.sleep(0.3)")
     assert slow["wall_s"] >= 0.3 and slow["wall_s"] > slow["cpu_s"] > 0
-    assert measured(tmp_path, "raise SystemExit(5)")[0] == 5
-    assert measured(tmp_path, "import os; os.kill(os.getpid(), 9)")[0] == 137
+    for ends, code in (("raise SystemExit(5)", 5), ("import os; os.kill(os.getpid(), 9)", 137)):
+        with pytest.raises(EnveditError, match=f"exit code {code};"):
+            measured(tmp_path, ends)
 
 
-@pytest.mark.parametrize("compiling, longest, calls", [
-    (0, 60, 1), (9, 60, 2), (1, 0, 1),
-], ids=["nothing", "ever", "too long to repeat"])  # fmt: skip
-def test_a_run_that_compiled_is_made_again(tmp_path, monkeypatch, compiling, longest, calls):
+@pytest.mark.parametrize(("compiling", "calls"), [(0, 1), (9, 2)], ids=["nothing", "ever"])
+def test_a_run_that_compiled_is_made_again(tmp_path, monkeypatch, compiling, calls):
     made = []
-
-    def run(command):
-        made.append(command)
-        (tmp_path / "cost.json").write_text('{"wall_s": 1.0}')
-        return SimpleNamespace(returncode=0)
-
-    monkeypatch.setattr(cell, "subprocess", SimpleNamespace(run=run))
+    monkeypatch.setattr(cost, "measured", lambda command, folder: made.append(command) or {"wall_s": 1.0})
     monkeypatch.setattr(cell, "kernels", lambda: min(len(made), compiling))
-    monkeypatch.setattr(cell, "AGAIN_BELOW", longest)
     assert cell.carry_out(tmp_path) == {"wall_s": 1.0} and len(made) == calls
 
 
@@ -142,7 +134,7 @@ def sunny(tmp_path):
     sky = np.full((48, 96, 3), 0.3, np.float32)
     sky[12, 60] = (1400, 1200, 900)  # as much light as leaves the picture below white
     images.write_exr(tmp_path / "sunny.exr", sky)
-    return config.from_dict(plan.base(str(tmp_path / "sunny.exr"), "matte"), tmp_path)
+    return config.from_dict(experiment.base(str(tmp_path / "sunny.exr"), "matte"), tmp_path)
 
 
 @pytest.mark.slow
@@ -205,13 +197,13 @@ def one(setting, time, psnr, **more):
 def results(tmp_path, monkeypatch):
     """Results of all six cells: the standard preset's runs and one setting, ``x``."""
     (tmp_path / "puresky").mkdir()
-    for i, name in enumerate(plan.MAPS):
+    for i, name in enumerate(experiment.MAPS):
         sky = np.full((4, 8, 3), i, np.float32)
         images.write_exr(tmp_path / f"puresky/{name}_puresky_1k.exr", sky)
     monkeypatch.setenv("ENVEDIT_DATA", str(tmp_path))
     cases = experiment.cases(SimpleNamespace(sets=[]))
     for i, case in enumerate(cases):
-        runs = [one(plan.STANDARD[k], (9.0, 10.0, 14.0)[k], 40.0 + k) for k in range(3)]
+        runs = [one(STANDARD[k], (9.0, 10.0, 14.0)[k], 40.0 + k) for k in range(3)]
         runs.append(one("x", 5.0 if i % 2 else 20.0, 70.0, sun_degrees=2.0 if i else None))
         folder = case.job().folder(tmp_path / "out")
         folder.mkdir(parents=True)
@@ -232,7 +224,7 @@ def test_ratios_are_to_the_median_of_the_cell_and_changes_from_the_same_seed(res
     assert means["standard, seed 1"][:2] == ["6", "1.00"] and means["standard, seed 1"][4] == "+1.00"
     assert means["(unedited map)"] == ["6", *["-"] * 7]
     rows = {tuple(line[:2]): line[2:] for line in lines[heads[1] :] if line}
-    cell_of = f"{plan.MAPS[0]}, matte"
+    cell_of = f"{experiment.MAPS[0]}, matte"
     x = rows[cell_of, "x"]
     assert x[:6] == ["20.0", "19.5", "0.5", "0.5", "0.8", "2.00"]
     assert x[6:] == ["55.0", "20.0", "0.700", "-"]

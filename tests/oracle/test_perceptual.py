@@ -5,6 +5,7 @@ one test has those, where they are.
 """
 
 import functools
+import importlib.util
 
 import drjit as dr
 import mitsuba as mi
@@ -16,9 +17,19 @@ from envedit.losses.perceptual import convolution, installed
 from envedit.losses.perceptual.backbones import KINDS, Backbone
 from envedit.losses.perceptual.distances import Dists, Lpips
 from tests.oracles import ROOT
-from tests.oracles import perceptual as drawn
 from tests.oracles.plain import double, gradient, single
 
+
+def _script():
+    spec = importlib.util.spec_from_file_location(
+        "perceptual_reference", ROOT / "experiments/references/perceptual.py"
+    )
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+drawn = _script()
 state_of = functools.cache(drawn.tensors)
 
 # ---- what the tests share ----------------------------------------------------------------------------------
@@ -106,7 +117,7 @@ def recorded():
 
 @pytest.mark.parametrize("measure, kind, size", drawn.CASES)
 def test_measures_match_the_authors_code(recorded, dists, lpips, backbones, measure, kind, size):
-    """PyTorch, torchvision, lpips and DISTS_pytorch; see tests/oracles/perceptual.py."""
+    """PyTorch, torchvision, lpips and DISTS_pytorch; see experiments/references/perceptual.py."""
     case = f"{measure}_{kind}_{size[0]}x{size[1]}/"
     x, y, directions = drawn.images(*size)
     assert drawn.checksum((x, y, directions)) == recorded[case + "images"]
@@ -129,7 +140,7 @@ def test_measures_match_the_authors_code(recorded, dists, lpips, backbones, meas
 
 @pytest.mark.slow
 def test_trained_networks_score_as_the_authors_programs(data):
-    """Ten pairs, the weights that ``envedit weights`` fetches; see tests/oracles/perceptual.py."""
+    """Ten pairs, the weights that ``envedit weights`` fetches; see experiments/references/perceptual.py."""
     folder = data / "weights"
     if not (folder / installed.VGG).is_file():
         pytest.skip(f"no trained weights in {folder}")

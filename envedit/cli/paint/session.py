@@ -650,9 +650,8 @@ class Session:
     def _carried_out(self, settings, folder, stage):
         """Carry a configuration out as `envedit run` does; returns the result, and warnings of its files."""
         base = self.project.base
-        with output_folder.alone(folder):
-            read = output_folder.inputs_of(settings, base)
-            output_folder.prepare_folder(folder, output_folder.names(folder), read)
+        read = output_folder.inputs_of(settings, base)
+        with output_folder.results_in(folder, output_folder.names(folder), read):
             watch = pipeline.Watch(stage, self._progress)
             result = pipeline.run(settings, folder=folder, base=base, watch=watch)
             stage("writing")

@@ -15,7 +15,7 @@ import numpy as np
 
 from envedit.core.color import luminance
 from envedit.core.color import tonemap as apply_tonemap
-from envedit.core.errors import InputError, counted, place_of
+from envedit.core.errors import InputError, texels_are
 from envedit.core.types import ArrayLike, Views
 
 if TYPE_CHECKING:
@@ -45,9 +45,7 @@ def checked(image: ArrayLike, name: str) -> np.ndarray:
         raise InputError(f"{name}: expected an image of shape (H, W, 3), got {image.shape}.")
     bad = ~np.isfinite(image).all(axis=2)
     if bad.any():
-        where = f"the first at {place_of(bad)}"
-        texels_are = counted(bad.sum(), "texel is", "texels are")
-        raise InputError(f"{name}: {texels_are} not finite, {where}; repair the image first.")
+        raise InputError(f"{name}: {texels_are(bad, 'not finite')}; repair the image first.")
     return image
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from envedit import config, inputs
 from envedit.core import primaries
-from envedit.core.errors import ConfigError, counted
+from envedit.core.errors import ConfigError, texels_are
 from envedit.core.radiance import HALF_MAX
 from envedit.core.rows import bands
 from envedit.core.types import FilePath
@@ -126,9 +126,6 @@ def cut_to_half(values: np.ndarray, path: FilePath, remedy: str) -> tuple[np.nda
         return values, []
     excess = np.maximum(values[over] - HALF_MAX, 0).sum(dtype=np.float64)
     lost = 100 * float(excess / values.sum(dtype=np.float64))
-    texels_are = counted(over.sum(), "texel is", "texels are")
-    warning = (
-        f"{os.fsdecode(path)}: {texels_are} brighter than {HALF_MAX:g}, the largest half, and "
-        f"cut there: {lost:.2g} % of the sum of all texels is lost; {remedy}"
-    )
-    return np.minimum(values, np.float32(HALF_MAX)), [warning]
+    many = texels_are(over, f"brighter than {HALF_MAX:g}, the largest half")
+    lost_light = f"cut there: {lost:.2g} % of the sum of all texels is lost; {remedy}"
+    return np.minimum(values, np.float32(HALF_MAX)), [f"{os.fsdecode(path)}: {many}; {lost_light}"]

@@ -14,7 +14,7 @@ from experiments.paint.figure10 import RENDERED, drag, opened, place, prepared
 BUTTONS = (
     "undo",
     "redo",
-    "add-light",
+    "add",
     "light-mute",
     "light-delete",
     "region-remove",
@@ -69,8 +69,8 @@ def light(page, chance):
 
 def region(page, chance):
     """Draw a region of the map."""
-    page.get_by_test_id("region").click()
-    kind = page.get_by_test_id("region-action")
+    page.locator("#region").click()
+    kind = page.locator("#region-action")
     if kind.is_visible():
         kind.select_option(chance.choice(["keep", "scale", "fill"]))
         drag(page, spots(page, chance, "#map-stack", chance.randrange(2, 6)), MOVE_S)
@@ -78,14 +78,14 @@ def region(page, chance):
 
 def button(page, chance):
     """Press a button that can be pressed."""
-    pressed = page.get_by_test_id(chance.choice(BUTTONS))
+    pressed = page.locator(f"#{chance.choice(BUTTONS)}")
     if pressed.is_visible() and pressed.is_enabled():
         pressed.click()
 
 
 def turn(page, chance):
     """Turn the sky."""
-    page.get_by_test_id("degrees").fill(str(chance.randrange(-400, 400)))
+    page.locator("#degrees").fill(str(chance.randrange(-400, 400)))
     page.keyboard.press("Enter")
 
 
@@ -118,7 +118,7 @@ def spots(page, chance, name, count) -> list:
 def at_rest_mb(page, process) -> float:
     """Take everything back, wait until nothing is left to do, and return the memory."""
     page.keyboard.press("Escape")
-    page.get_by_test_id("clear").click(force=True)
+    page.locator("#clear").click(force=True)
     time.sleep(LONGEST_PAUSE_S)
     page.wait_for_function(RENDERED, timeout=600_000)
     time.sleep(LONGEST_PAUSE_S)

@@ -58,7 +58,7 @@ MOST_DRAWN = 20
 """Lights that :func:`lights_figure` draws."""
 
 
-def show(value: object, digits: int = 4) -> str:
+def show(value: object) -> str:
     """Print a number of a table, or several; a missing one, or one that is not finite, is a dash."""
     if isinstance(value, list):
         return ", ".join(show(item) for item in value)
@@ -67,7 +67,7 @@ def show(value: object, digits: int = 4) -> str:
         return "–"
     if finite is None:
         return escape(value)
-    return f"{finite:.0f}" if finite == int(finite) and abs(finite) < 1e6 else f"{finite:.{digits}g}"
+    return f"{finite:.0f}" if finite == int(finite) and abs(finite) < 1e6 else f"{finite:.4g}"
 
 
 def listing(items: Iterable[object]) -> str:

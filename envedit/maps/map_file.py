@@ -126,6 +126,6 @@ def cut_to_half(values: np.ndarray, path: FilePath, remedy: str) -> tuple[np.nda
         return values, []
     excess = np.maximum(values[over] - HALF_MAX, 0).sum(dtype=np.float64)
     lost = 100 * float(excess / values.sum(dtype=np.float64))
-    many = texels_are(over, f"brighter than {HALF_MAX:g}, the largest half")
+    many = texels_are(np.asarray(over), f"brighter than {HALF_MAX:g}, the largest half")
     lost_light = f"cut there: {lost:.2g} % of the sum of all texels is lost; {remedy}"
     return np.minimum(values, np.float32(HALF_MAX)), [f"{os.fsdecode(path)}: {many}; {lost_light}"]

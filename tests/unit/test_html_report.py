@@ -136,7 +136,10 @@ def test_report_of_a_known_map_and_a_failed_edit(tmp_path):
 def test_report_escapes_all_text(tmp_path):
     nasty = "<script>alert('&')</script> Gemälde/заря \udcff"
     file = "<script>alert('&') Gemälde"
-    changes = {"metrics": {nasty: nasty, "tonemap": nasty, "fit": {nasty: 1}}, "history": [{"iteration": 0, nasty: 1.0}]}
+    changes = {
+        "metrics": {nasty: nasty, "tonemap": nasty, "fit": {nasty: 1}},
+        "history": [{"iteration": 0, nasty: 1.0}],
+    }
     changes |= {"lights": {"before": [], "after": [light(1, 20, 30)]}, "warnings": [nasty], "notes": [nasty]}
     settings = config.Config(scene=config.Scene(file=file))
     page = write(tmp_path / "r.html", settings, {nasty: nasty}, **changes)

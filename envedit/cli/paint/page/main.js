@@ -296,14 +296,14 @@ function viewed(stroke) {
 // A highlight or a shadow is dragged: first ask whose it is, then where that light must go. A drag is one step of
 // history: it ends with the answer to the last question, or after UNANSWERED where none comes.
 const UNANSWERED = 5000;
-let dragged = tool, picked = -1, point = [], place = null, asked = 0, answered = 0, ended = false, unanswered = 0, held = null;
+let dragged = tool, picked = -1, point, place = null, asked = 0, answered = 0, ended = false, unanswered = 0, held = null;
 function pick(phase, x, y, event) {
   if (phase === "start") dragged = tool; // another may be chosen before all is answered
   const placing = PICKS[dragged][1];
   if (phase === "start") {
     clearTimeout(unanswered);
     picked = placing && lights.list()[lights.chosen] ? lights.chosen : -1;
-    point = [];
+    point = undefined;
     place = held = null;
     ended = false;
   }
@@ -335,7 +335,7 @@ RECEIVED.picked = (message) => {
   } else if (message.text) say(`Light not moved: ${message.text}`);
   else if (message.azimuth === undefined) {
     picked = message.light;
-    point = message.point ?? [];
+    point = message.point;
     if (picked < 0) say("No light of the map lights this pixel: add one, or paint");
     else {
       lights.choose(picked);

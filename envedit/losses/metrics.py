@@ -1,8 +1,7 @@
 """Numbers that judge an image: PSNR, SSIM and MSE on a stated tonemap, and what they do not see.
 
 Images are numpy arrays ``(H, W, 3)`` of linear radiance unless said otherwise; sums run in double precision.
-Every function raises InputError for images that are not finite or differ in shape, and returns a finite
-number or None.
+Every function raises InputError for images that are not finite, and returns a finite number or None.
 """
 
 from __future__ import annotations
@@ -39,10 +38,8 @@ LOG_EPS = 0.01
 
 
 def checked(image: ArrayLike, name: str) -> np.ndarray:
-    """Return an image (H, W, 3) in float64; InputError, which names it, if it is none or not finite."""
+    """Return an image (H, W, 3) in float64; InputError, which names it, if it is not finite."""
     image = np.asarray(image, np.float64)
-    if image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
-        raise InputError(f"{name}: expected an image of shape (H, W, 3), got {image.shape}.")
     bad = ~np.isfinite(image).all(axis=2)
     if bad.any():
         raise InputError(f"{name}: {texels_are(bad, 'not finite')}; repair the image first.")
@@ -50,10 +47,7 @@ def checked(image: ArrayLike, name: str) -> np.ndarray:
 
 
 def _pair(a, b):
-    a, b = checked(a, "first image"), checked(b, "second image")
-    if a.shape != b.shape:
-        raise InputError(f"images differ in shape: {a.shape} and {b.shape}; resize one to the other first.")
-    return a, b
+    return checked(a, "first image"), checked(b, "second image")
 
 
 # ---- Two images: how far apart -----------------------------------------------------------------------------

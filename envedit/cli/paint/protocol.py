@@ -200,7 +200,8 @@ class Save:
 
 
 MESSAGES = {
-    "document": Edit, "pick": Pick, "open": Open, "choose": Choose, "look": ApplyLook, "sky": Sky, "save": Save,
+    "document": Edit, "pick": Pick, "open": Open, "choose": Choose, "look": ApplyLook, "sky": Sky,
+    "save": Save,
 }  # fmt: skip
 """Types of messages from the page, and what they become."""
 _CHECKS: dict[str, Callable[[Any], Any]] = {

@@ -523,7 +523,7 @@ class _Edit:
             nothing = towards is not None and 0 <= towards < LEAST_GAIN
             how = f"{100 * (towards or 0):.0f} % of the painted change"
         else:
-            measures["worse"] = metrics.worse(*pair)
+            measures["worse"] = metrics.gained(*pair) < 0
             nothing = metrics.off(pair[0], pair) and metrics.gained(*pair) < LEAST_GAIN
             how = f"{after} now, {before} before"
         if measures["worse"]:

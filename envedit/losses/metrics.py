@@ -115,11 +115,6 @@ def saturated(compared: Iterable[dict]) -> bool:
     return beyond and all(result.get("log_rmse") is not None for result in compared)
 
 
-def worse(result: dict, other: dict) -> bool:
-    """Say whether of two results of `compare` with the same image the first is farther from it."""
-    return gained(result, other) < 0
-
-
 def gained(result: dict, other: dict) -> float:
     """Return by which share the first of two results of `compare` with an image is nearer; below 0: farther.
 

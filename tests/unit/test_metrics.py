@@ -62,7 +62,7 @@ def test_where_a_display_shows_nothing_the_logarithm_judges(rng, tonemap, exposu
     near, far = (metrics.compare(wanted * factor, wanted, tonemap) for factor in (1.1, 2.0))
     assert near["beyond_display"] == beyond
     assert metrics.saturated([near, far]) == bool(beyond)
-    assert metrics.worse(far, near) and not metrics.worse(near, far) and not metrics.worse(near, near)
+    assert metrics.gained(far, near) < 0 < metrics.gained(near, far) and metrics.gained(near, near) == 0
     assert metrics.score(far, [near]).endswith(" stops" if beyond else " dB")
 
 

@@ -96,8 +96,7 @@ def _section(heading, figures, columns=None):
     return title + parts.grid(figures, columns) if figures else ""
 
 
-# ----------------------------------------------------------------------------------------------------------
-# Pictures
+# ---- Pictures ----------------------------------------------------------------------------------------------
 
 
 def _by_view(renders, views):
@@ -223,8 +222,7 @@ def _losses(history, settings):
     return curves + (f'<p class="soft">{escape(about)}</p>' if about else "")
 
 
-# ----------------------------------------------------------------------------------------------------------
-# Tables
+# ---- Tables ------------------------------------------------------------------------------------------------
 
 
 def _quality(metrics):

@@ -25,10 +25,6 @@ MOST_RESIZED = 16
 """Times as wide, or as narrow, as the rendering that a picture may be: others are no resized exports."""
 
 
-# ----------------------------------------------------------------------------------------------------------
-# The picture that comes back
-
-
 def read(
     file: FilePath,
     shape: Shape,

@@ -354,7 +354,7 @@ RECEIVED.picked = (message) => {
 
 // Whose light a pixel shows, in words: lights that give 1 % of it or more, and the rest of the map.
 function madeBy(shares) {
-  const listed = lights.list(), percent = (share) => `${Math.round(100 * share)} %`;
+  const listed = lights.list();
   const named = (i) => i < 0 ? "a light added by paint" : `light ${i + 1}${listed[i]?.entry.name ? ` (${listed[i].entry.name})` : ""}`;
   const parts = shares.filter(([, share]) => share >= 0.01).sort((a, b) => b[1] - a[1]);
   const rest = 1 - parts.reduce((sum, [, share]) => sum + share, 0);

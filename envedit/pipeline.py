@@ -218,7 +218,8 @@ class _Edit:
             with self.clock("judge_s"):
                 spp, cache = self.settings.output.spp, self.settings.renderer.cache
                 initial, _, _ = rendered(self.scene, self.original, spp, self.seeds.painted_initial, cache)
-            self.target = Target(initial, None, None, "", initial=initial)
+            everywhere = np.ones((*initial.shape[:2], 1), np.float32)
+            self.target = Target(initial, everywhere, None, "", initial=initial)
             self.notes.append("no target: the result is compared with the initial rendering")
         else:
             source = self.target.source
@@ -449,14 +450,13 @@ class _Edit:
 
     def compare_photograph(self):
         """Set the camera of the metrics, and the pixels that the light does not explain."""
-        photo, weight = self.target.photo, self.target.weight
+        photo = self.target.photo
         likelihood = replace(Likelihood.of_target(self.target), least_noise=SIGMA)
         residual = photo.missed(self.renders["edited"])
         of_rendering = 0.0 if self.noise is None else self.noise
         deviations = sizes(residual)[..., 0] / np.hypot(likelihood.noise(residual), of_rendering)
         self.outliers = (deviations > OUTLIER_DEVIATIONS) & (likelihood.weight[..., 0] > 0)
-        counted = 1.0 if weight is None else float((weight > 0).mean())
-        share = float(self.outliers.mean()) / counted
+        share = float(self.outliers.mean()) / float((self.target.weight > 0).mean())
         self.metrics["camera"] = {**photo.measures, "outliers": share}
         if photo.aligns and not photo.recognised:
             line = "target.file: its outlines are not clearly those of the scene: is it of this view?"
@@ -523,7 +523,7 @@ class _Edit:
             nothing = towards is not None and 0 <= towards < LEAST_GAIN
             how = f"{100 * (towards or 0):.0f} % of the painted change"
         else:
-            measures["worse"] = metrics.worse(*pair)
+            measures["worse"] = metrics.gained(*pair) < 0
             nothing = metrics.off(pair[0], pair) and metrics.gained(*pair) < LEAST_GAIN
             how = f"{after} now, {before} before"
         if measures["worse"]:

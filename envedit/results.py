@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import itertools
 from dataclasses import dataclass, field, replace
 from os import PathLike
 from pathlib import Path
@@ -225,10 +226,9 @@ class Result:
         folder = Path(folder).absolute()
         settings = replace(self.settings, output=replace(self.settings.output, dir=str(folder)))
         warnings = [*self.warnings]
-        with output_folder.alone(folder):
-            read = [*output_folder.inputs_of(settings, self.base)]
-            read += self.memory.scene.files if self.memory and self.memory.scene else ()
-            output_folder.prepare_folder(folder, output_folder.names(folder), read)
+        given = self.memory.scene.files if self.memory and self.memory.scene else ()
+        read = itertools.chain(output_folder.inputs_of(settings, self.base), given)
+        with output_folder.results_in(folder, output_folder.names(folder), read):
             settings = run_folder.write_given(settings, folder, self.memory, warnings)
             own = replace(self, settings=settings, metrics=copy.deepcopy(self.metrics), warnings=warnings)
             return run_folder.write(folder, own, import_s=0.0)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
 import shutil
-import sys
 
 from envedit.cli import console
 
@@ -26,45 +26,35 @@ def main(argv: list[str] | None = None) -> int:
     )
     parser.add_argument("--empty", action="store_true", help="delete all entries, and nothing else")
     arguments = parser.parse_args(argv)
-    code = 0
+    return console.exit_code(console.Console(), lambda: _visit(arguments.empty))
+
+
+def _visit(empty):
+    """Say how many entries of each kind there are, or delete them."""
+    from envedit.core.array_cache import DiskCache, cache_folder
+    from envedit.core.errors import InputError
+
     for kind, what in KINDS.items():
-        folder, sizes, failed = _visit(kind, arguments.empty)
-        if folder is None:
+        cache = DiskCache(cache_folder(kind))
+        if cache.folder is None:
             print("no home folder: nothing is kept")
             break
-        entries = f"{len(sizes)} {'entry' if len(sizes) == 1 else 'entries'}, {sum(sizes) / 1e6:.1f} MB"
-        print(f"{folder}: {what}: {entries}{' deleted' if arguments.empty else ''}")
-        if failed is not None:
-            where = failed.filename or folder
-            print(f"envedit: {where}: {failed.strerror}; check its permissions", file=sys.stderr)
-            code = 3
-    if not arguments.empty:
-        print("to delete all entries: envedit cache --empty")
-    return code
-
-
-def _visit(kind, empty):
-    """Count the entries of a kind, or delete them; returns folder, bytes of each, and the last OSError."""
-    from envedit.core.array_cache import DiskCache, cache_folder
-
-    cache = DiskCache(cache_folder(kind))
-    sizes = []
-    failed = None
-    try:
-        converted = cache.folder.glob("*/converted.json") if cache.folder else ()
-        files = [*cache.files(), *(state.parent for state in converted)]
-    except OSError as error:
-        return cache.folder, [], error
-    for file in files:
+        sizes = []
         try:
-            size = sum(path.stat().st_size for path in (file, *file.rglob("*")))
-            if empty and file.is_dir():
-                shutil.rmtree(file)
-            elif empty:
-                file.unlink()
-            sizes.append(size)
-        except FileNotFoundError:  # another process deleted it first
-            pass
+            for file in (*cache.files(), *(state.parent for state in cache.folder.glob("*/converted.json"))):
+                with contextlib.suppress(FileNotFoundError):  # another process deleted it first
+                    sizes.append(_size(file))
+                    if empty:
+                        shutil.rmtree(file) if file.is_dir() else file.unlink()
         except OSError as error:
-            failed = error
-    return cache.folder, sizes, failed
+            where = error.filename or cache.folder
+            raise InputError(f"{where}: {error.strerror}; check its permissions") from None
+        entries = f"{len(sizes)} {'entry' if len(sizes) == 1 else 'entries'}, {sum(sizes) / 1e6:.1f} MB"
+        print(f"{cache.folder}: {what}: {entries}{' deleted' if empty else ''}")
+    if not empty:
+        print("to delete all entries: envedit cache --empty")
+    return 0
+
+
+def _size(file):
+    return sum(path.stat().st_size for path in (file, *file.rglob("*")))

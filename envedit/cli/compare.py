@@ -54,8 +54,7 @@ def _compare(arguments, console):
     stems = [Path(name).stem for name in (arguments.first, arguments.second)]
     folder = Path(arguments.out or f"{stems[0]}_{stems[1]}_compared")
     about = f"log2 of luminance of {stems[1]} over {stems[0]}; red: brighter; full colour: {scale:g} stops"
-    with output_folder.alone(folder):
-        output_folder.prepare_folder(folder, RESULTS, [arguments.first, arguments.second])
+    with output_folder.results_in(folder, RESULTS, [arguments.first, arguments.second]):
         write_atomically(folder / "difference.png", png(difference, {"Description": about}))
         manifest.write_json(folder / "compare.json", measured)
     files = {name: str(folder / name) for name in RESULTS}

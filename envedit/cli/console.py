@@ -71,17 +71,17 @@ class Console:
 
     def _report(self, kind, text, line):
         if self._json_lines:
-            from envedit.cli.progress import JsonProgress
+            from envedit.cli.progress import tell
 
-            JsonProgress().tell(kind, text=text)
+            tell(kind, text=text)
         else:
             print(line, file=sys.stderr)
 
     def progress(self) -> Progress:
         """Return what shows progress."""
-        from envedit.cli.progress import JsonProgress, Progress
+        from envedit.cli.progress import Progress
 
-        return JsonProgress() if self._json_lines and not self._quiet else Progress(quiet=self._quiet)
+        return Progress(self._quiet, self._json_lines)
 
     def close(self, code: int) -> None:
         """Write the object, if one is asked for."""

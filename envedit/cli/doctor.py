@@ -18,7 +18,6 @@ import platform
 import signal
 import subprocess
 import sys
-import tempfile
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -71,29 +70,23 @@ def check(variant: str = "llvm_ad_rgb") -> Diagnosis:
     program = (
         f"import sys; sys.path.append({root!r}); from envedit.cli import doctor; doctor._probe({variant!r})"
     )
-    # A file, not a pipe, for stderr: LLVM's last words can be megabytes.
-    with tempfile.TemporaryFile() as errors:
-        try:
-            child = subprocess.run(
-                [sys.executable, "-P", "-c", program],  # -P: no module of the working folder
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.PIPE,
-                stderr=errors,
-                timeout=_TIMEOUT_SECONDS,
-            )
-            code = child.returncode
-            output = child.stdout
-        except subprocess.TimeoutExpired as error:
-            code = None
-            output = error.stdout or b""
-        except OSError as error:
-            return Diagnosis(False, (f"cannot start {sys.executable}: {error.strerror or error}",))
-        errors.seek(0)
-        error_output = errors.read(200_000).decode(errors="replace")
+    command = [sys.executable, "-P", "-c", program]  # -P: no module of the working folder
+    code = None
+    ended: subprocess.CompletedProcess | subprocess.TimeoutExpired
+    try:
+        ended = subprocess.run(
+            command, stdin=subprocess.DEVNULL, capture_output=True, timeout=_TIMEOUT_SECONDS
+        )
+        code = ended.returncode
+    except subprocess.TimeoutExpired as error:
+        ended = error
+    except OSError as error:
+        return Diagnosis(False, (f"cannot start {sys.executable}: {error.strerror or error}",))
+    output, error_output = ((text or b"").decode(errors="replace") for text in (ended.stdout, ended.stderr))
 
     # ---- What it found out before it ended
     versions: dict[str, Any] = {}
-    for line in output.decode(errors="replace").splitlines():
+    for line in output.splitlines():
         with contextlib.suppress(ValueError):
             facts = json.loads(line)
             versions |= facts if isinstance(facts, dict) else {}

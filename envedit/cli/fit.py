@@ -17,6 +17,9 @@ from envedit.losses import metrics
 from envedit.report import manifest, output_folder, preview
 from envedit.representations.siren import fit
 
+RESULTS = ("fit.json", "fitted.exr", "preview.png")
+"""What the command leaves in its folder."""
+
 
 def main(argv: list[str] | None = None) -> int:
     """Fit a map, write what the network makes of it, and say how good it is; returns the exit code."""
@@ -50,8 +53,7 @@ def _run(arguments, console):
     doctor.select(settings.variant)
     original, warnings = inputs.load_map(settings.input)
     folder = Path(arguments.out or f"{Path(arguments.map).stem}_fit")
-    with output_folder.alone(folder):
-        output_folder.prepare_folder(folder, ("fit.json", "fitted.exr", "preview.png"), [arguments.map])
+    with output_folder.results_in(folder, RESULTS, [arguments.map]):
         for line in warnings:
             console.warn(line)
         _fit(arguments, settings, original, folder, console)

@@ -52,8 +52,7 @@ def _lights(arguments, console):
     up = np.array([[0.0, 1.0, 0.0]])
     about = {"map": arguments.map, "width": shape[1], "height": shape[0], "lights": numbered}
     about["sky_irradiance"] = map_lights.irradiance(sky, up)[0].tolist()
-    with output_folder.alone(folder):
-        output_folder.prepare_folder(folder, RESULTS, [arguments.map])
+    with output_folder.results_in(folder, RESULTS, [arguments.map]):
         marks = {"source": arguments.map}
         images.write_exr(folder / "sky.exr", sky, marks, chromaticities=input_map.chromaticities)
         images.write_exr(folder / "lights.exr", alone, marks, chromaticities=input_map.chromaticities)

@@ -104,10 +104,9 @@ def _run(arguments, console, begun):
     # ---- The edit
     doctor.select(settings.variant)
     folder = Path(settings.output.dir)
-    with output_folder.alone(folder):
-        read = output_folder.inputs_of(settings, base)
-        spare = [] if file is None else [file]
-        output_folder.prepare_folder(folder, output_folder.names(folder), read, arguments.resume, spare)
+    read = output_folder.inputs_of(settings, base)
+    spare = [] if file is None else [file]
+    with output_folder.results_in(folder, output_folder.names(folder), read, arguments.resume, spare):
         unfinished = (folder / "checkpoint.npz").exists() or not (folder / "metrics.json").exists()
         if arguments.resume and not unfinished:
             _check_same(settings, folder)

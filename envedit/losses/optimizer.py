@@ -23,6 +23,9 @@ from envedit.core.types import Arrays, Params, Tensor
 
 # ---- Adam --------------------------------------------------------------------------------------------------
 
+EPS = 1e-8
+"""Above 0, so that 0 / 0 cannot arise."""
+
 
 class Adam:
     r"""Adam with epsilon after the bias correction, as PyTorch has it (`drjit.opt.Adam` adds it before).
@@ -38,7 +41,7 @@ class Adam:
 
     ``params``, tensors of one precision, are starting values, which are copied: read them as
     ``adam.params[name]``. ``lr`` is that of a `step` that is not given its own, ``betas`` are the decay of
-    the two moments, in [0, 1), and ``eps`` is above 0, so that 0 / 0 cannot arise.
+    the two moments, in [0, 1); ``eps`` is :data:`EPS`.
     """
 
     def __init__(
@@ -46,11 +49,9 @@ class Adam:
         params: Mapping[str, Tensor],
         lr: float,
         betas: tuple[float, float] = (0.9, 0.999),
-        eps: float = 1e-8,
     ):
         self.lr = lr
         self.betas = tuple(betas)
-        self.eps = eps
         self.t = 0
         # Copies in memory of Dr.Jit's own: a literal would be part of the first step's kernel, and an array
         # wrapped around numpy's memory is not aligned, which is part of a kernel too and costs a compilation.
@@ -85,7 +86,7 @@ class Adam:
             g = dr.detach(grads[name]).array
             m = b1 * self._m[name].array + (1 - b1) * g
             v = b2 * self._v[name].array + (1 - b2) * dr.square(g)
-            update = rate * m / (dr.sqrt(v) / root + self.eps)
+            update = rate * m / (dr.sqrt(v) / root + EPS)
             new[name] = p.array - update, m, v
             # v takes up the gradient's square; an infinite one gives finite steps, of zero, for good.
             good = dr.isfinite(v) & dr.isfinite(new[name][0])

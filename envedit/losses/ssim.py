@@ -1,4 +1,4 @@
-"""Structural similarity with a hand-written gradient, and the shape checks and sums that all losses share.
+"""Structural similarity with a hand-written gradient, and the sums that all losses share.
 
 Images are ``(H, W, C)`` tensors of any Dr.Jit precision; a ``weight`` is ``(H, W, 1)`` or ``(H, W, C)``.
 """
@@ -10,34 +10,16 @@ from typing import Any
 
 import drjit as dr
 
-from envedit.core.errors import InputError
 from envedit.core.types import DrArray, Shape, Tensor, Views
 
-# ---- Shapes and sums, shared with the other losses ---------------------------------------------------------
-
-
-def check_image(x: Tensor, name: str) -> None:
-    """Refuse what is not an image ``(H, W, C)``."""
-    if x.ndim != 3 or 0 in x.shape:
-        raise InputError(f"{name}: expected an image of shape (H, W, C), got {tuple(x.shape)}.")
-
-
-def check_pair(x: Tensor, reference: Tensor) -> None:
-    """Refuse images that differ in shape."""
-    check_image(x, "image")
-    if x.shape != reference.shape:
-        shapes = f"image {tuple(x.shape)} and reference {tuple(reference.shape)}"
-        raise InputError(f"{shapes} differ in shape: resize one to the other first.")
+# ---- Weights and sums, shared with the other losses --------------------------------------------------------
 
 
 def expand(weight: Tensor, shape: Shape) -> DrArray:
     """Return the weight as a flat array with one entry per texel and channel."""
-    height, width, channels = shape
     if weight.shape == shape:
         return weight.array
-    if weight.shape != (height, width, 1):
-        raise InputError(f"weight {tuple(weight.shape)} fits neither {shape} nor {(height, width, 1)}.")
-    index = dr.arange(dr.uint32_array_t(type(weight.array)), height * width * channels) // channels
+    index = dr.arange(dr.uint32_array_t(type(weight.array)), math.prod(shape)) // shape[2]
     return dr.gather(type(weight.array), weight.array, index)
 
 
@@ -70,12 +52,10 @@ class Ssim:
     Squares must be representable: ``|x|`` up to 1e18 in single precision, NaN beyond.
 
     The ``reference`` (H, W, C), y, is not differentiated. A ``weight``, (H, W, 1) or (H, W, C), not negative,
-    is that of the window centred there; windows that cross an edge do not exist. InputError if a shape does
-    not fit.
+    is that of the window centred there; windows that cross an edge do not exist.
     """
 
     def __init__(self, reference: Tensor, weight: Tensor | None = None):
-        check_image(reference, "reference")
         self.shape = height, width, channels = tuple(reference.shape)
         self._rows, self._columns = _gaussian(height), _gaussian(width)
         self.map_shape = height - len(self._rows) + 1, width - len(self._columns) + 1, channels
@@ -88,8 +68,6 @@ class Ssim:
 
     def __call__(self, x: Tensor) -> DrArray:
         """Return ``1 - mean SSIM`` of the image ``(H, W, C)`` as a size-1 array, differentiable in ``x``."""
-        if tuple(x.shape) != self.shape:
-            raise InputError(f"SSIM: image {tuple(x.shape)} and reference {self.shape} differ in shape.")
         if not dr.grad_enabled(x):
             return self._evaluate(x.array, False)[0]
         return dr.custom(KnownGradient, x.array, self)

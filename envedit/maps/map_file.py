@@ -11,7 +11,7 @@ import numpy as np
 
 from envedit import config, inputs
 from envedit.core import primaries
-from envedit.core.errors import ConfigError, counted
+from envedit.core.errors import ConfigError, texels_are
 from envedit.core.radiance import HALF_MAX
 from envedit.core.rows import bands
 from envedit.core.types import FilePath
@@ -90,18 +90,15 @@ def write(
     like: InputMap | None = None,
     half: bool | None = None,
     rec709: bool = False,
-    remedy: str = "write it as .hdr, or darken the map",
 ) -> list[str]:
     """Write a map, by the ending of its name as OpenEXR or Radiance; returns warnings: what half cannot hold.
 
     ``values`` (H, W, 3) are linear, in the colours of ``like``, the map that was read, whose chromaticities
     are those of the result; with ``rec709`` they are converted. None: Rec. 709. ``half`` is for OpenEXR; by
-    default as the file of ``like``, otherwise float. ``remedy`` ends the warning. ConfigError if the path is
-    that of ``like``, NumericalError if a value is not finite, InputError if the file cannot be written.
+    default as the file of ``like``, otherwise float. NumericalError if a value is not finite, InputError if
+    the file cannot be written.
     """
     path = Path(os.fsdecode(path))
-    if like is not None and os.path.realpath(path) == os.path.realpath(like.source):
-        raise ConfigError(f"{path}: is the map that was read: give another name")
     space = None if like is None else like.chromaticities
     if rec709 and space is not None:
         values = primaries.converted(values, primaries.to_rec709(space))
@@ -112,23 +109,16 @@ def write(
     marks = {} if like is None else {"source": like.source}
     if half is None:
         half = like is not None and like.half
+
+    # ---- What half cannot hold is cut
     warnings: list[str] = []
-    if half:
-        values, warnings = cut_to_half(values, path, remedy)
+    over = np.asarray((values > HALF_MAX).any(axis=2))
+    if half and over.any():
+        lost = np.maximum(values[over] - HALF_MAX, 0).sum(dtype=np.float64) / values.sum(dtype=np.float64)
+        values = np.minimum(values, np.float32(HALF_MAX))
+        warnings.append(
+            f"{path}: {texels_are(over, f'brighter than {HALF_MAX:g}, the largest half')}; cut there: "
+            f"{100 * lost:.2g} % of the sum of all texels is lost; write floats or .hdr, or darken the map"
+        )
     images.write_exr(path, values, marks, half=half, chromaticities=space)
     return warnings
-
-
-def cut_to_half(values: np.ndarray, path: FilePath, remedy: str) -> tuple[np.ndarray, list[str]]:
-    """Cut a map (H, W, 3) to what half can hold; returns it and a warning that ends in ``remedy``."""
-    over = (values > HALF_MAX).any(axis=2)
-    if not over.any():
-        return values, []
-    excess = np.maximum(values[over] - HALF_MAX, 0).sum(dtype=np.float64)
-    lost = 100 * float(excess / values.sum(dtype=np.float64))
-    texels_are = counted(over.sum(), "texel is", "texels are")
-    warning = (
-        f"{os.fsdecode(path)}: {texels_are} brighter than {HALF_MAX:g}, the largest half, and "
-        f"cut there: {lost:.2g} % of the sum of all texels is lost; {remedy}"
-    )
-    return np.minimum(values, np.float32(HALF_MAX)), [warning]

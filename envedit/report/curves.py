@@ -78,7 +78,7 @@ def _series(rows):
         names = ["residual"]
     series = {}
     for name in names:
-        values = [(row.get("iteration", i), number(row.get(name))) for i, row in enumerate(rows)]
+        values = [(row["iteration"], number(row.get(name))) for row in rows]
         points = [(step, math.log10(value)) for step, value in values if value and value > 0]
         if points:
             series[name] = points
@@ -112,16 +112,11 @@ def normalised(rows: list[dict], ramps: dict, iterations: int) -> tuple[list[dic
         return rows, about
 
     scaled = []
-    for i, row in enumerate(rows):
-        row = dict(row)
-        step = number(row.get("iteration", i)) or 0.0
+    for row in rows:
+        terms = {name: row[name] for name in ramps if name in names}
         for name, (start, end) in changing.items():
-            if (value := number(row.get(name))) is not None:
-                row[name] = value * end / ramp(start, end, step, iterations)
-        terms = [number(row.get(name)) for name in ramps if name in names]
-        if number(row.get("loss")) is not None and None not in terms:
-            row["loss"] = sum(terms)
-        scaled.append(row)
+            terms[name] *= end / ramp(start, end, row["iteration"], iterations)
+        scaled.append(row | terms | {"loss": sum(terms.values())})
     which = ", ".join(f"{name} (from {start:g} to {end:g})" for name, (start, end) in changing.items())
     return scaled, f"{about} Weights change during the run: {which}. All are drawn with the last ones."
 

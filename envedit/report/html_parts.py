@@ -58,16 +58,14 @@ MOST_DRAWN = 20
 """Lights that :func:`lights_figure` draws."""
 
 
-def show(value: object, digits: int = 4) -> str:
+def show(value: object) -> str:
     """Print a number of a table, or several; a missing one, or one that is not finite, is a dash."""
     if isinstance(value, list):
         return ", ".join(show(item) for item in value)
     finite = number(value)
-    if value is None or isinstance(value, (float, np.floating)) and finite is None:
-        return "–"
     if finite is None:
-        return escape(value)
-    return f"{finite:.0f}" if finite == int(finite) and abs(finite) < 1e6 else f"{finite:.{digits}g}"
+        return escape(value) if isinstance(value, (str, bool)) else "–"
+    return f"{finite:.0f}" if finite == int(finite) and abs(finite) < 1e6 else f"{finite:.4g}"
 
 
 def listing(items: Iterable[object]) -> str:
@@ -92,8 +90,7 @@ def grid(figures: Sequence[str], columns: int | None = None) -> str:
     return f'<div class="grid" style="grid-template-columns:repeat({columns},1fr)">{"".join(figures)}</div>'
 
 
-# ----------------------------------------------------------------------------------------------------------
-# Figures
+# ---- Figures -----------------------------------------------------------------------------------------------
 
 
 def figure(pixels: np.ndarray, caption: str, below: str = "", over: str = "") -> str:

@@ -26,21 +26,6 @@ from envedit.report.verdict import verdict
 if TYPE_CHECKING:
     from envedit.results import Result
 
-STAGES = {
-    "import": "importing",
-    "target": "rendering the target",
-    "fit": "fitting the representation",
-    "transport": "tracing the light transport, or reading it from disk",
-    "reach": "estimating what is feasible",
-    "start": "searching for lights",
-    "edit": "optimising",
-    "solve": "searching and optimising",
-    "judge": "rendering the result",
-    "full": "writing the maps, also at the resolution of the file",
-    "report": "writing the report",
-    "per_iteration": "one iteration",
-}
-"""Keys of the metrics' timing in words, without their units."""
 _COMPARED = {
     "initial": "initial rendering",
     "render": "edited rendering",
@@ -97,7 +82,6 @@ def write_report(path: FilePath, result: Result, manifest: dict) -> None:
         _quality(metrics),
         _numbers(metrics),
         _map_table(maps),
-        _timing(metrics),
         f"<h2>Choices made</h2>{parts.listing(result.notes)}" if result.notes else "",
         f"<h2>Configuration</h2><pre>{escape(config.to_toml(settings))}</pre>",
         "<h2>Manifest</h2><details><summary>Versions, machine, seeds, inputs</summary>"
@@ -112,8 +96,7 @@ def _section(heading, figures, columns=None):
     return title + parts.grid(figures, columns) if figures else ""
 
 
-# ----------------------------------------------------------------------------------------------------------
-# Pictures
+# ---- Pictures ----------------------------------------------------------------------------------------------
 
 
 def _by_view(renders, views):
@@ -239,8 +222,7 @@ def _losses(history, settings):
     return curves + (f'<p class="soft">{escape(about)}</p>' if about else "")
 
 
-# ----------------------------------------------------------------------------------------------------------
-# Tables
+# ---- Tables ------------------------------------------------------------------------------------------------
 
 
 def _quality(metrics):
@@ -280,20 +262,10 @@ def _numbers(metrics):
         for key, value in metrics.items()
         if not isinstance(value, (dict, type(None))) and key not in elsewhere
     }
-    for part in ("natural", "painted", "fit", "transport"):
+    for part in ("natural", "painted", "fit", "transport", "timing"):
         others |= {f"{part}.{key}": value for key, value in (metrics.get(part) or {}).items()}
     rows = [[key, parts.show(value)] for key, value in others.items()]
     return f"<details><summary>Numbers of metrics.json</summary>{parts.table(['', ''], rows)}</details>"
-
-
-def _timing(metrics):
-    """List where the time went."""
-    rows = []
-    for key, value in metrics["timing"].items():
-        stage, _, unit = key.rpartition("_")
-        if value is not None:
-            rows.append([STAGES.get(stage, stage.replace("_", " ")), f"{parts.show(value, 3)} {unit}"])
-    return f"<h2>Time</h2>{parts.table(['', ''], rows)}"
 
 
 def _map_table(maps):

@@ -24,8 +24,7 @@ from envedit.core import atomic_files, machine
 from envedit.core.atomic_files import write_atomically
 from envedit.core.types import FilePath
 
-# ----------------------------------------------------------------------------------------------------------
-# Files
+# ---- Files -------------------------------------------------------------------------------------------------
 
 
 def plain(value: Any, where: str, lost: list[str]) -> Any:
@@ -81,8 +80,7 @@ def columns(rows: Iterable[dict]) -> list[str]:
     return list(dict.fromkeys(str(key) for row in rows for key in row))
 
 
-# ----------------------------------------------------------------------------------------------------------
-# The manifest
+# ---- The manifest ------------------------------------------------------------------------------------------
 
 
 def manifest(config_summary: dict, inputs: dict, variant: str) -> dict:

@@ -36,7 +36,6 @@ def write_map(
         input_map,
         settings.half,
         rec709=settings.format == "hdr",  # as nearly every program reads it
-        remedy="set output.half = false",
     )
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from envedit import config
 from envedit.core import file_locks
-from envedit.core.errors import InputError
+from envedit.core.errors import EnveditError, InputError
 from envedit.core.types import FilePath, Views
 
 RESULTS = (
@@ -106,53 +106,77 @@ def alone(folder: Path) -> Iterator[None]:
                 path.rmdir()
 
 
-def prepare_folder(
+@contextlib.contextmanager
+def results_in(
     folder: Path,
     names: Sequence[str],
     inputs: Iterable[FilePath] = (),
     keep: bool = False,
     spare: Iterable[FilePath] = (),
-) -> None:
-    """Move what an earlier run left in a folder to ``earlier-N`` in it.
+) -> Iterator[None]:
+    """Make a folder for results, as :func:`alone`, and move what an earlier run left there to ``earlier-N``.
 
     InputError if an input lies where a result would go, or the folder cannot be used. Of the results'
     ``names`` the first, which says that a run is complete, is moved first, and the last is a checkpoint's.
+    After an error of the user's before any result is written, what was moved is moved back.
 
     ``inputs`` are what the run reads, and must not be moved; they are looked at where the folder holds any
     result. ``keep`` leaves what is there, if it is complete or there is a checkpoint: it is to be continued.
     What is to ``spare`` is copied and not moved, if it is among the results: the run will be asked for by it
     again.
     """
-    try:
-        # ---- What lies there, and whether an input is among it
-        old = [folder / name for name in names if (folder / name).exists()]
-        read = {os.path.realpath(path) for path in inputs} if old else set()
-        read |= {os.path.dirname(path) for path in read}  # a result may be a folder
-        if mine := [path for path in old if os.path.realpath(path) in read]:
-            raise InputError(f"{mine[0]}: this input lies where its own results would go: use another folder")
-
-        # ---- What is moved or copied
-        if keep and {folder / names[0], folder / names[-1]} & set(old):
-            old = []
-        spared = {os.path.realpath(path) for path in spare}
-        kept = [path for path in old if os.path.realpath(path) in spared]
-        if len(kept) < len(old) or not all(_copied(path) for path in kept):
-            numbers = [path.name.rpartition("-")[2] for path in folder.glob(f"{EARLIER}-*")]
-            number = 1 + max((int(n) for n in numbers if n.isdecimal()), default=0)
-            aside = folder / f"{EARLIER}-{number}"
-            aside.mkdir()
-            for path in old:
-                if path in kept:
-                    shutil.copy2(path, aside / path.name)
-                else:
-                    path.rename(aside / path.name)
-    except OSError as error:
-        raise _unusable(folder, error) from error
-    if not os.access(folder, os.W_OK):
-        raise InputError(f"{folder}: cannot be written to: use another folder")
+    with alone(folder):
+        try:
+            moved = _set_aside(folder, names, inputs, keep, spare)
+        except OSError as error:
+            raise _unusable(folder, error) from error
+        if not os.access(folder, os.W_OK):
+            raise InputError(f"{folder}: cannot be written to: use another folder")
+        left = _found(folder, names)
+        try:
+            yield
+        except EnveditError:
+            if moved and _found(folder, names) == left:
+                for path in reversed(moved):
+                    path.rename(folder / path.name)
+                shutil.rmtree(moved[0].parent)  # copies
+            raise
 
 
-def _copied(path):
+def _found(folder, names):
+    """Return the results that lie in a folder."""
+    return [folder / name for name in names if (folder / name).exists()]
+
+
+def _set_aside(folder, names, inputs, keep, spare):
+    """Move results to the next ``earlier-N``; returns where those lie that were moved, and not copied."""
+    # ---- What lies there, and whether an input is among it
+    old = _found(folder, names)
+    read = {os.path.realpath(path) for path in inputs} if old else set()
+    read |= {os.path.dirname(path) for path in read}  # a result may be a folder
+    if mine := [path for path in old if os.path.realpath(path) in read]:
+        raise InputError(f"{mine[0]}: this input lies where its own results would go: use another folder")
+
+    # ---- What is moved or copied
+    if keep and {folder / names[0], folder / names[-1]} & set(old):
+        return []
+    spared = {os.path.realpath(path) for path in spare}
+    copied = [path for path in old if os.path.realpath(path) in spared]
+    moved = [path for path in old if path not in copied]
+    if not moved and all(map(_is_kept, copied)):
+        return []
+    numbers = [path.name.rpartition("-")[2] for path in folder.glob(f"{EARLIER}-*")]
+    number = 1 + max((int(n) for n in numbers if n.isdecimal()), default=0)
+    aside = folder / f"{EARLIER}-{number}"
+    aside.mkdir()
+    for path in copied:
+        shutil.copy2(path, aside / path.name)
+    for path in moved:
+        path.rename(aside / path.name)
+    return [aside / path.name for path in moved]
+
+
+def _is_kept(path):
     """Say whether a file lies in one of the folders of earlier runs beside it, as it is."""
     return any(
         filecmp.cmp(path, earlier, shallow=False)

@@ -34,8 +34,7 @@ FULL_COLOUR_DIFFERENCE = 0.25
 """Difference of display values that :func:`unreachable` shows in full colour."""
 
 
-# ----------------------------------------------------------------------------------------------------------
-# One picture
+# ---- One picture -------------------------------------------------------------------------------------------
 
 
 def known(pictures: Mapping[str, np.ndarray | None]) -> dict[str, np.ndarray]:
@@ -84,8 +83,7 @@ def exposed(stops: float) -> str:
     return f", {stops:+g} stops" if stops else ""
 
 
-# ----------------------------------------------------------------------------------------------------------
-# The preview
+# ---- The preview -------------------------------------------------------------------------------------------
 
 
 def sheet(
@@ -134,8 +132,7 @@ def _framed(pixels, width):
     return np.pad(pixels, (width, width, (0, 0)), constant_values=BACKGROUND)
 
 
-# ----------------------------------------------------------------------------------------------------------
-# Differences
+# ---- Differences -------------------------------------------------------------------------------------------
 
 DIVERGING = np.array([[33, 102, 172], [146, 197, 222], [247, 247, 247], [244, 165, 130], [178, 24, 43]])
 """Evenly spaced colours of a difference: blue where it is negative, white at 0, red where it is positive."""
@@ -185,8 +182,7 @@ def colours(scale: np.ndarray, position: np.ndarray) -> np.ndarray:
     return np.rint(np.stack(channels, axis=-1)).astype(np.uint8)
 
 
-# ----------------------------------------------------------------------------------------------------------
-# Influence
+# ---- Influence ---------------------------------------------------------------------------------------------
 
 # Nine colours of viridis (Smith and van der Walt 2015), evenly spaced: their lightness rises evenly.
 RISING = np.array([[68, 1, 84], [71, 44, 122], [59, 81, 139], [44, 113, 142], [33, 144, 141],

@@ -109,8 +109,7 @@ def export(
     ]
 
 
-# ----------------------------------------------------------------------------------------------------------
-# What a picture was exported with
+# ---- What a picture was exported with ----------------------------------------------------------------------
 
 
 def origin(settings: config.Config, shape: Shape, name: str) -> Info:

@@ -43,8 +43,7 @@ def differs(values: np.ndarray, before: np.ndarray, info: Info, top: int, spread
     return np.abs(values - before).max(axis=2) * top > CODE_TOLERANCE[top]
 
 
-# ----------------------------------------------------------------------------------------------------------
-# JPEG
+# ---- JPEG --------------------------------------------------------------------------------------------------
 
 
 def _painted_jpeg(codes, before, quality):

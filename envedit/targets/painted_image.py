@@ -12,7 +12,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from envedit.core.color import TONEMAPS, inverse_tonemap, tonemap
-from envedit.core.errors import InputError, counted, place_of
+from envedit.core.errors import InputError, counted, place_of, texels_are
 from envedit.core.resampling import fit
 from envedit.core.types import FilePath, Shape
 from envedit.images import images
@@ -23,10 +23,6 @@ from envedit.targets.strokes import Painted
 NEARLY_ALL = 0.9
 MOST_RESIZED = 16
 """Times as wide, or as narrow, as the rendering that a picture may be: others are no resized exports."""
-
-
-# ----------------------------------------------------------------------------------------------------------
-# The picture that comes back
 
 
 def read(
@@ -267,10 +263,8 @@ def planes(file: FilePath, pixels: np.ndarray, warnings: list[str]) -> tuple[np.
     if values.shape[2] == 1:
         values = values.repeat(3, axis=2)
         warnings.append(f"{file}: read as grey")
-    if (negative := np.any(values < 0, axis=2)).any():
-        where = f"the first at {place_of(negative)}"
-        pixels_are = counted(negative.sum(), "pixel is", "pixels are")
-        warnings.append(f"{file}: {pixels_are} negative, {where}: set to 0")
+    if (negative := values < 0).any():
+        warnings.append(f"{file}: {texels_are(negative, 'negative', unit='pixel')}: set to 0")
     return np.maximum(values, 0), alpha, top
 
 

@@ -148,12 +148,10 @@ class Photo:
         """The photograph as radiance of the scene, (h, w, 3) float32."""
         return (self.camera.radiance(self.values) / self.let_through).astype(np.float32)
 
-    def under(self, curve: str, rendering: np.ndarray, weight: np.ndarray | None) -> Photo:
+    def under(self, curve: str, rendering: np.ndarray, weight: np.ndarray) -> Photo:
         """Return it with another curve, and the factor at which a rendering is nearest in the median."""
         exposed = Camera(curve).radiance(self.values) / self.let_through
-        telling = ~self.clipped & (self.values > DARKEST) & (rendering > 0) & (exposed > 0)
-        if weight is not None:
-            telling &= weight > 0
+        telling = ~self.clipped & (self.values > DARKEST) & (rendering > 0) & (exposed > 0) & (weight > 0)
         if telling.mean() < LEAST_TELLING:
             raise InputError(
                 f"target: {100 * telling.mean():.2g} % of the photograph's values are neither black nor "

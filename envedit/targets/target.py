@@ -39,7 +39,7 @@ class Target:
     """The picture wanted."""
 
     picture: np.ndarray  # (h, w, 3), linear radiance
-    weight: np.ndarray | None  # (h, w, 1), how much each pixel counts; None: all the same
+    weight: np.ndarray  # (h, w, 1) float32, how much each pixel counts
     envmap: np.ndarray | None  # (H, W, 3), the map that makes the picture, where it is known
     source: str  # one line for the report
     warnings: tuple[str, ...] = ()  # what the user should know about the picture
@@ -67,12 +67,11 @@ class Target:
         return self.picture if self.compared is None else self.compared
 
     @property
-    def known_weight(self) -> np.ndarray | None:
-        """How much each pixel counts where lower bounds do not, (h, w, 1); None: all the same."""
-        if self.clipped is None or not self.clipped.any():
+    def known_weight(self) -> np.ndarray:
+        """How much each pixel counts where lower bounds do not, (h, w, 1)."""
+        if self.clipped is None:
             return self.weight
-        weight = np.ones((*self.clipped.shape[:2], 1), np.float32) if self.weight is None else self.weight
-        known = np.where(self.clipped.any(axis=2, keepdims=True), 0, weight).astype(np.float32)
+        known = np.where(self.clipped.any(axis=2, keepdims=True), 0, self.weight).astype(np.float32)
         return known if known.any() else self.weight  # a few pixels of bounds: better these than nothing
 
     def aimed_at(self, picture: np.ndarray) -> Target:
@@ -92,7 +91,6 @@ class Target:
         weight = self.weight
         if self.photo is not None and photograph.placed != self.photo.placed:
             before = self.photo.counts
-            weight = np.ones_like(before) if weight is None else weight
             share = np.divide(weight, before, out=np.zeros_like(before), where=before > 0)
             weight = share * photograph.counts
         known = replace(self, photo=photograph, clipped=photograph.clipped)
@@ -100,7 +98,7 @@ class Target:
 
     def held(self, paint: float, hold: float) -> Target:
         """Return the target with other weights of paint and rest, among the pixels that count."""
-        assert self.coverage is not None and self.weight is not None, "nothing was painted"
+        assert self.coverage is not None, "nothing was painted"
         uncounted = self.weight[..., 0] == 0
         return replace(self, weight=pixel_weight(self.coverage, uncounted, paint, hold))
 
@@ -232,13 +230,12 @@ def _of_rendering(settings, scene, envmap, picture, mask, how=""):
     asked = _asked(chosen, picture, mask)
     if not ((image.coverage[..., 0] > 0) & ~image.excluded).any():
         raise InputError("target: no pixel of the picture counts: all are clipped, masked or transparent")
-    weight = None if (image.coverage == 1).all() else image.coverage
     picture = np.minimum(image.picture, np.float32(BRIGHTEST))
     noise = rendered_anew.noise(picture, scene.rows)
     initial, spp, _ = with_noise(settings, scene, envmap)
     spp = rendered_anew.samples(picture, noise, initial, spp, scene.rows)
     source += f"{how}, as noisy as {spp} samples a pixel"
-    made = Target(picture, weight, None, source, image.warnings, asked=asked, noise=noise, spp=spp)
+    made = Target(picture, image.coverage, None, source, image.warnings, asked=asked, noise=noise, spp=spp)
     return replace(made, clipped=image.clipped)
 
 
@@ -264,8 +261,7 @@ def _of_photo(settings, scene, envmap, picture, mask):
     asked = _asked(chosen, None, None)
     placed = f", {photo.placed.summary}" if photo.placed.summary else ""
     source = f"a photograph of the scene: {file}{placed}"
-    counts = None if (photo.counts == 1).all() else photo.counts
-    target = Target(photo.picture, counts, None, source, tuple(warnings), asked=asked, photo=photo)
+    target = Target(photo.picture, photo.counts, None, source, tuple(warnings), asked=asked, photo=photo)
     target = target.developed(photo)
 
     # ---- Its noise
@@ -347,8 +343,7 @@ def _seen(target, hidden, curve):
         target = replace(target, warnings=(*target.warnings, line))
     if not hidden.any():
         return target
-    weight = np.ones((*hidden.shape, 1), np.float32) if target.weight is None else target.weight
-    weight = np.where(hidden[..., None], 0, weight).astype(np.float32)
+    weight = np.where(hidden[..., None], 0, target.weight).astype(np.float32)
     if not weight.any():
         raise InputError("target: no pixel counts: none that is asked for sees a surface (hide_emitters)")
     share = f"{100 * hidden.mean():.3g} % of the pixels see no surface (hide_emitters) and do not count"
@@ -370,13 +365,12 @@ def _rendered(settings, scene, envmap, other):
         source = f"rendered under the map turned by {chosen.degrees:g} degrees"
     true = np.ascontiguousarray(true, np.float32)
     picture, spp, noise = with_noise(settings, scene, true)
-    weights = np.ones((*picture.shape[:2], 1), np.float32)
+    weight = np.ones((*picture.shape[:2], 1), np.float32)
     for view, mask in _by_view(scene, chosen.views, chosen.masks).items():
         if mask:
             rows = scene.rows[view]
-            weights[rows] = painted_image.read_mask(mask, weights[rows].shape[:2])
-    weight = weights if chosen.masks else None
-    asked = (true,) if weight is None else (true, weight)
+            weight[rows] = painted_image.read_mask(mask, weight[rows].shape[:2])
+    asked = (true, weight) if chosen.masks else (true,)
     source += f", {spp} samples a pixel"
     return Target(picture, weight, true, source, warnings, asked=asked, noise=noise, spp=spp)
 

@@ -68,8 +68,7 @@ def worked_on(
     """
     chosen = settings.target
     hidden = hidden_pixels(small)
-    if target.coverage is None or target.initial is None or target.weight is None:
-        weight = None
+    if target.coverage is None or target.initial is None:
         if target.photo is not None:
             target = target.developed(target.photo.laid((small.height, small.width)))
             picture, noise, spp = target.picture, rendered_anew.noise(target.picture, small.rows), target.spp
@@ -81,8 +80,7 @@ def worked_on(
             spp = rendered_anew.samples(picture, noise, *with_noise(settings, small, envmap)[:2], small.rows)
         else:
             picture, spp, noise = with_noise(settings, small, target.envmap)
-        if target.weight is not None:
-            weight = np.where(hidden[..., None], 0, at_size(target.weight, scene, small)).astype("f4")
+        weight = np.where(hidden[..., None], 0, at_size(target.weight, scene, small)).astype(np.float32)
         return replace(target, picture=picture, noise=noise, spp=spp, weight=weight)
     initial = initial_rendering.initial(small, envmap, settings)
     change = at_size(target.picture - target.initial, scene, small)

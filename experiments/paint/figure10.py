@@ -31,17 +31,17 @@ from experiments.painted_edits import experiment as painted_edits
 
 MAP = "kloofendal_48d_partly_cloudy"
 CORNER_S, SETTING_S = 0.4, 1.0
-TEXT = "document.querySelector('[data-testid=status]').textContent"
+TEXT = "document.querySelector('#status').textContent"
 STATUS = f"() => {TEXT}.includes"
 DRAWN = (
-    "() => { const of = document.querySelector('[data-testid=status]').dataset;"
+    "() => { const of = document.querySelector('#status').dataset;"
     " return Number(of.frame) > 0 && ['done', 'rendering', 'solving'].includes(of.state); }"
 )
 FEASIBLE, RENDERED = f"{STATUS}('% feasible')", f"{STATUS}('with 256 samples')"
 # What is feasible is asked when no step and no light leads further.
 SETTLED = f"() => /how much of the target|% feasible/.test({TEXT})"
 DIFFERS = re.compile(r"differs from the one shown before by (\S+) of a display value")
-SAVED = "() => document.querySelector('[data-testid=message]').textContent.includes('Saved in')"
+SAVED = "() => document.querySelector('#message').textContent.includes('Saved in')"
 
 
 def prepared(folder: Path) -> Path:
@@ -101,13 +101,13 @@ def drag(page, places, pause, steps=1):
 
 def choose(page, name):
     """Press a button."""
-    page.get_by_test_id(name).click()
+    page.locator(f"#{name}").click()
     time.sleep(SETTING_S)
 
 
 def set_to(page, name, value):
     """Set a slider, or a colour."""
-    page.get_by_test_id(name).fill(str(value))
+    page.locator(f"#{name}").fill(str(value))
     time.sleep(SETTING_S)
 
 
@@ -182,10 +182,10 @@ def edit(settings, folder, strokes) -> dict:
 
         # ---- Save
         clicked = time.perf_counter()
-        page.get_by_test_id("save").click()
+        page.locator("#save").click()
         page.wait_for_function(SAVED, timeout=600_000)
         saved = time.perf_counter()
-        message = page.get_by_test_id("message").inner_text()
+        message = page.locator("#message").inner_text()
     found = json.loads((work / "edit_out/metrics.json").read_text())["painted"]
     differs = DIFFERS.search(message)
     return found | {

@@ -15,7 +15,7 @@ from experiments.paint.figure10 import opened, place, prepared
 DRAG_S = 6.0
 SIZES = {"128": (128, 1024), "512": (512, 1024), "4k map": (128, 4096)}
 """Name -> pixels across, and texels across of the map's file."""
-HANDLE = "[data-testid=handle-1]"
+HANDLE = "#handle-1"
 
 
 def dragged(page, start, path) -> list[dict]:
@@ -72,7 +72,7 @@ def rates(settings, folder, texels) -> dict:
             time.sleep(3)
 
         # ---- A shadow is painted
-        page.get_by_test_id("tool-shadow").click()
+        page.locator("#tool-shadow").click()
         x, y = place(page, "#overlay", 0.2, 0.8)
         stroke = dragged(page, (x, y), lambda t: (x + 0.5 * width * t, y + 0.03 * width * np.sin(30 * t)))
     solved = {entry["steps"] for entry in stroke if "status" in entry}

@@ -56,7 +56,7 @@ def button(page, chance):
 
 def turn(page, chance):
     """Turn the sky."""
-    page.get_by_test_id("degrees").fill(str(chance.randrange(-400, 400)))
+    page.locator("#degrees").fill(str(chance.randrange(-400, 400)))
     page.keyboard.press("Enter")
 
 
@@ -89,7 +89,7 @@ def spots(page, chance, name, count) -> list:
 def at_rest_mb(page, process) -> float:
     """Take everything back, wait until nothing is left to do, and return the memory."""
     page.keyboard.press("Escape")
-    page.get_by_test_id("clear").click(force=True)
+    page.locator("#clear").click(force=True)
     time.sleep(LONGEST_PAUSE_S)
     page.wait_for_function(RENDERED, timeout=600_000)
     time.sleep(LONGEST_PAUSE_S)

@@ -28,8 +28,8 @@ with sync_api.sync_playwright() as playwright:
     page = browser.new_page(viewport={"width": 1280, "height": 720})
     page.set_default_timeout(120_000)
     page.goto(sys.argv[1])
-    sync_api.expect(page.get_by_test_id("status")).to_have_attribute("data-state", "done", timeout=120_000)
-    page.get_by_test_id("tool-shadow").click()
+    sync_api.expect(page.locator("#status")).to_have_attribute("data-state", "done", timeout=120_000)
+    page.locator("#tool-shadow").click()
     box = page.locator("#overlay").bounding_box()
     x, y = box["x"] + 0.4 * box["width"], box["y"] + 0.5 * box["height"]
     page.mouse.move(x, y)
@@ -37,8 +37,8 @@ with sync_api.sync_playwright() as playwright:
     page.mouse.move(x + 0.2 * box["width"], y, steps=5)
     page.mouse.up()
     page.wait_for_function("() => envedit.log.some((e) => e.phase === 'done')")
-    page.get_by_test_id("save").click()
-    sync_api.expect(page.get_by_test_id("message")).to_contain_text("Saved in", timeout=240_000)
+    page.locator("#save").click()
+    sync_api.expect(page.locator("#message")).to_contain_text("Saved in", timeout=240_000)
     browser.close()
 open("DONE", "w").close()
 """

@@ -137,6 +137,7 @@ def test_a_wrong_picture_is_not_ready(monkeypatch):
     class Child:
         returncode = 0
         stdout = b'{"radiance": 0.25}\n{"done": true}\n'
+        stderr = b""
 
     monkeypatch.setattr(doctor.subprocess, "run", lambda *a, **k: Child)
     found = doctor.check()

@@ -78,13 +78,15 @@ class Page:
     def __init__(self, browser, url, made=None):
         self.page = made or browser.new_page(viewport={"width": 1280, "height": 720})
         self.page.set_default_timeout(120_000)
-        self.get = self.page.get_by_test_id
         self.faults, self.asked = [], []
         self.page.on("pageerror", lambda error: self.faults.append(str(error)))
         self.page.on("console", lambda m: self.faults.append(m.text) if m.type == "error" else None)
         self.page.on("request", lambda request: self.asked.append(request.url))
         self.page.goto(url)
         self.status = self.get("status")
+
+    def get(self, name):
+        return self.page.locator(f"#{name}")
 
     def settled(self, rendered=True):
         """Wait for the solution of the last edit and the rendering that follows it."""
@@ -150,7 +152,7 @@ def test_paint_drag_undo_save_and_reopen(browser, file):
         sync_api.expect(page.get("unreachable")).to_be_hidden()
         page.get("redo").click()
         page.settled(False)
-        x, y = page.at("[data-testid=handle-1]", 0.5, 0.5)
+        x, y = page.at("#handle-1", 0.5, 0.5)
         painted = page.picture("map")
         page.drag((x, y), (x - 30, y + 5), (x - 60, y + 5))
         until(lambda: "[[input.lights]]" in kept.read_text())
@@ -198,7 +200,7 @@ def test_a_shadow_is_dragged_and_what_goes_along_is_chosen(browser, file):
         x, y = page.at("#overlay", 10.5 / 48, 33.5 / 48)
         page.page.mouse.move(x, y)
         page.page.mouse.down()
-        until(lambda: page.get("light-panel").get_attribute("disabled") is None)
+        until(lambda: page.get("light").get_attribute("disabled") is None)
         page.page.mouse.move(*page.at("#overlay", 10.5 / 48, 40.5 / 48), steps=4)
         page.page.mouse.up()
         until(lambda: kept.exists() and "[[input.lights]]" in kept.read_text())
@@ -222,7 +224,7 @@ def test_a_shadow_is_dragged_and_what_goes_along_is_chosen(browser, file):
         action = {"label": "Drag light 1 there", "change": {"lights": [light], "strokes": []}}
         advice = {"text": "", "actions": [action]}
         # In one go: the session's own advice may come at any time.
-        button = "document.querySelector('[data-testid=advice-0]')"
+        button = "document.querySelector('#advice-0')"
         page.page.evaluate(f"(advice) => {{ envedit.advise(advice); {button}.click(); }}", advice)
         until(lambda: "azimuth = 200" in kept.read_text() and "[[target.strokes]]" not in kept.read_text())
         assert config.load(kept).input.lights[0]["flux"] == [0.5, 0.5, 0.5]
@@ -312,7 +314,7 @@ def test_lights_are_placed_by_clicks_and_shaped(browser, file, tmp_path, here):
         size_and_flux_are_dragged(page, lights)
         # ---- Without a chosen light, the sun casts the shadow
         page.page.keyboard.press("Escape")
-        sync_api.expect(page.get("light-panel")).to_contain_text("No light chosen")
+        sync_api.expect(page.get("light")).to_contain_text("No light chosen")
         page.get("tool-cast").click()
         page.page.mouse.click(*page.at("#overlay", 0.25, 0.85))
         sync_api.expect(message).to_contain_text("Light 1 casts a shadow here")
@@ -334,7 +336,7 @@ def lights_are_listed(page, kept):
         get(name).fill(str(value))
         page.page.keyboard.press("Enter")
 
-    get("add-light").click()
+    get("add").click()
     write("list-name-1", "key")
     write("list-stops-1", -1)
     write("list-kelvin-2", 3000)
@@ -466,7 +468,7 @@ def map_is_levelled(page, kept, session):
     until(lambda: orientation() == (100, 12, 5))
     toward = Orientation(100, 12, 5).matrix @ session.placed.lights[0].direction
     azimuth, elevation = angles(toward)
-    box, at = (page.page.locator(name).bounding_box() for name in ("#map-stack", "[data-testid=handle-1]"))
+    box, at = (page.page.locator(name).bounding_box() for name in ("#map-stack", "#handle-1"))
     seen = at["x"] + at["width"] / 2 - box["x"], at["y"] + at["height"] / 2 - box["y"]
     expected = azimuth / 360 * box["width"], (90 - elevation) / 180 * box["height"]
     assert seen == pytest.approx(expected, abs=1)
@@ -488,7 +490,7 @@ def a_light_has_a_role(page, kept):
     def lights():
         return [(one.get("light"), one.get("role")) for one in config.load(kept).input.lights]
 
-    page.get("add-light").click()
+    page.get("add").click()
     page.get("list-role-2").select_option("rim")
     until(lambda: lights() == [(None, "rim")])
 
@@ -598,10 +600,10 @@ def test_views_as_tabs_names_focus_order_and_contrast(browser, tmp_path):
             page.page.keyboard.press("Tab")
             reached.append(page.page.evaluate(
                 "() => { const e = document.activeElement;"
-                " return e.dataset.testid ?? (e.id || e.tagName.toLowerCase()); }"
+                " return e.id || e.tagName.toLowerCase(); }"
             ))  # fmt: skip
         order = ["save", "tool-light", "shape-brush", "softness", "view-1", "overlay", "handle-1",
-                 "tool-turn", "map-exposure"]  # fmt: skip
+                 "turn", "map-exposure"]  # fmt: skip
         assert [name for name in reached if name in order] == order, reached
 
 

@@ -99,8 +99,9 @@ def test_an_input_in_a_folder_of_results_is_not_moved_away(tmp_path):
     start = tmp_path / "variants" / "1.npz"
     start.parent.mkdir()
     start.write_text("a solution")
-    with pytest.raises(InputError, match="variants: this input lies where its own results would go"):
-        output_folder.prepare_folder(tmp_path, output_folder.RESULTS, [start])
+    moved = output_folder.results_in(tmp_path, output_folder.RESULTS, [start])
+    with pytest.raises(InputError, match="variants: this input lies where its own results would go"), moved:
+        pass
     assert start.exists() and list(tmp_path.iterdir()) == [start.parent]
 
 
@@ -108,7 +109,8 @@ def test_what_no_checkpoint_protects_is_kept_even_by_a_resumed_run(tmp_path):
     names = ("metrics.json", "edited.exr", "config.toml", "checkpoint.npz")
 
     def prepare():
-        output_folder.prepare_folder(tmp_path, names, keep=True, spare=[tmp_path / "config.toml"])
+        with output_folder.results_in(tmp_path, names, keep=True, spare=[tmp_path / "config.toml"]):
+            pass
         return sorted(str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*") if path.is_file())
 
     (tmp_path / "config.toml").write_text("mine")
@@ -124,3 +126,18 @@ def test_what_no_checkpoint_protects_is_kept_even_by_a_resumed_run(tmp_path):
         prepare()
         assert len(list(tmp_path.rglob("*"))) == before and (tmp_path / "edited.exr").exists()
         (tmp_path / name).unlink()
+
+
+@pytest.mark.parametrize("written", [False, True])
+def test_a_run_that_fails_before_its_first_result_leaves_those_of_an_earlier_one(tmp_path, written):
+    names = ("metrics.json", "edited.exr", "config.toml", "checkpoint.npz")
+    for name in names[:3]:
+        (tmp_path / name).write_text("earlier")
+    run = output_folder.results_in(tmp_path, names, spare=[tmp_path / "config.toml"])
+    with pytest.raises(InputError, match="no such picture"), run:
+        assert not (tmp_path / "metrics.json").exists()
+        if written:
+            (tmp_path / "checkpoint.npz").write_text("new")
+        raise InputError("no such picture")
+    assert (tmp_path / "metrics.json").exists() != written
+    assert (tmp_path / "earlier-1").exists() == written

@@ -33,7 +33,7 @@ def test_curve_is_straight_for_a_geometric_series_and_leaves_out_what_is_no_valu
 
 @pytest.mark.parametrize("row", [{}, {"loss": None}, {"loss": np.nan}, {"loss": 0.0}, {"lr": 1.0}])
 def test_nothing_to_draw_is_an_empty_string(row):
-    assert curves.curves_svg([row]) == "" == curves.curves_svg([])
+    assert curves.curves_svg([{"iteration": 0} | row]) == "" == curves.curves_svg([])
 
 
 @pytest.mark.parametrize("values, labels", [

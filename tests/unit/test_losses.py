@@ -5,8 +5,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from envedit.core.errors import InputError
-from envedit.losses.losses import LOSSES, luminance
+from envedit.losses.losses import LOSSES
 from envedit.losses.ssim import Ssim
 from tests.oracles.devices import on_cpu
 from tests.oracles.plain import double, gradient, plain_ssim_loss, single
@@ -62,14 +61,11 @@ def test_equal_images_are_a_stationary_point(name, rng):
 
 
 @pytest.mark.parametrize("name", PICTURES)
-def test_weights_must_fit_and_give_zero_where_they_are_all_zero(name, rng):
+def test_weights_that_are_all_zero_give_zero(name, rng):
     x, y = rng.random((12, 12, 3)), rng.random((12, 12, 3))
     w = dr.opaque(mi.TensorXf, 0, (12, 12, 1))
     value, g = gradient(lambda t: loss(name, t, single(y), w), single(x))
     assert value == 0 and not g.any()
-    x = dr.zeros(mi.TensorXf, (12, 15, 3))
-    with pytest.raises(InputError, match=r"weight \(12, 14, 1\) fits neither"):
-        loss(name, x, x, dr.zeros(mi.TensorXf, (12, 14, 1)))
 
 
 @pytest.mark.parametrize("name", PICTURES)
@@ -79,18 +75,3 @@ def test_a_bad_texel_is_not_hidden_by_its_weight(name, bad, rng):
     x[5, 8, 1] = bad
     w[:, 8] = 0
     assert not np.isfinite(loss(name, single(x), single(y), single(w))[0])
-
-
-@pytest.mark.parametrize("name", sorted(set(NAMES) - {"l1", "tv"}))
-def test_shapes_must_agree(name):
-    x = dr.zeros(mi.TensorXf, (12, 15, 3))
-    with pytest.raises(InputError, match=r"image \(12, 15, 3\) and reference \(15, 12, 3\) differ in shape"):
-        loss(name, x, dr.zeros(mi.TensorXf, (15, 12, 3)))
-    with pytest.raises(InputError, match=r"expected an image of shape \(H, W, C\), got \(12, 15\)"):
-        loss(name, x[..., 0], x[..., 0])
-
-
-def test_luminance_needs_rgb():
-    x = dr.zeros(mi.TensorXf, (4, 4, 1))
-    with pytest.raises(InputError, match="luminance needs RGB"):
-        luminance(x, x)

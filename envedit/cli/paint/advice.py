@@ -30,14 +30,6 @@ MOST_NAMED = 3
 
 
 @dataclass(frozen=True)
-class Light:
-    """Renderings (h, w, 3) of what lights the pixels."""
-
-    white: np.ndarray  # under a map of radiance 1, without lamps
-    lamps: np.ndarray  # of the scene's lamps alone
-
-
-@dataclass(frozen=True)
 class Action:
     """What reaches more: a button's text, and what it changes of the document."""
 
@@ -51,12 +43,14 @@ def said(
     rendering: np.ndarray,
     reach: Reach,
     strokes: Sequence[np.ndarray],
-    light: Light,
+    white: np.ndarray,
+    lamps: np.ndarray,
 ) -> tuple[str, list[Action]]:
     """Say which strokes are missed, why the worst is, and what can be done; "" if enough is reached.
 
     Of what was asked for, ``request``, the ``rendering`` (h, w, 3) was reached, and ``reach`` is feasible.
-    ``strokes`` (h, w, 1) are the coverage of each stroke by itself.
+    ``strokes`` (h, w, 1) are the coverage of each stroke by itself; ``white`` and ``lamps`` (h, w, 3) are
+    renderings under a map of radiance 1, without lamps, and of the scene's lamps alone.
     """
     shares = {
         i: request.of_stroke(rendering, cover)
@@ -71,13 +65,13 @@ def said(
     dark = float((strokes[worst] * left).sum()) > 0
     stays = "too dark" if dark else "too bright"
     text = f"stroke {worst + 1} ({document.strokes[worst]['type']}) stays {stays}"
-    why, actions = _why(document, request, reach, strokes[worst], light, worst, dark)
+    why, actions = _why(document, request, reach, strokes[worst], white, lamps, worst, dark)
     others = [f"{i + 1} ({_percent(shares[i])})" for i in missed[1:MOST_NAMED]]
     also = f"; little is reached of {', '.join(others)} too" if others else ""
     return f"{text}: {why}{also}", actions
 
 
-def _why(document, request, reach, cover, light, i, dark):
+def _why(document, request, reach, cover, white, lamps, i, dark):
     """Return a phrase on why a stroke is missed, and what can be done about it in the document."""
     change = "brighter" if dark else "darker"
     follow = Action("Let the rest follow", {"rest": "follow"})
@@ -88,9 +82,9 @@ def _why(document, request, reach, cover, light, i, dark):
         return float((cover * picture).sum()) / (3 * area)
 
     # ---- Where the map cannot make it so
-    if dark and mean(light.white) < UNLIT_SHARE * light.white.mean():
+    if dark and mean(white) < UNLIT_SHARE * white.mean():
         return "hardly any light of the map reaches it", []
-    if not dark and mean(light.lamps) > 0.5 * mean(request.base):
+    if not dark and mean(lamps) > 0.5 * mean(request.base):
         return "most of its light is of lamps of the scene, which no map changes", []
     # ---- Where the settings keep it from being so
     if document.rest == "keep":

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import json
 import struct
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import MISSING, dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -41,8 +42,6 @@ SOURCES = ("transport", "mitsuba", "saved")
 PHASES = ("drawing", "dragging", "done")
 """A stroke is being drawn, a light is being dragged, or neither."""
 _LARGEST = 65504.0
-_COUNT = Integer(0, 2**53)
-_POINT = Numbers(*3 * [Number(-1e30, 1e30)])
 
 
 def unchanged(number: int | None) -> dict[str, Any]:
@@ -200,8 +199,29 @@ class Save:
     """Write the results."""
 
 
-def read(text: str | bytes, client: str = "") -> Edit | Pick | Choose | Open | ApplyLook | Sky | Save:
-    """Read a message from the page.
+MESSAGES = {
+    "document": Edit, "pick": Pick, "open": Open, "choose": Choose, "look": ApplyLook, "sky": Sky,
+    "save": Save,
+}  # fmt: skip
+"""Types of messages from the page, and what they become."""
+_CHECKS: dict[str, Callable[[Any], Any]] = {
+    "document": document,
+    "phase": Choice(*PHASES),
+    "x": Number(0, 1),
+    "y": Number(0, 1),
+    "light": Integer(-1, 100),
+    "of": Choice(*PICKED),
+    "point": Numbers(*3 * [Number(-1e30, 1e30)]),
+    "name": String(least=1),
+    "envmap": String(),
+    "text": String(),
+    **dict.fromkeys(("number", "painting", "view", "explanation"), Integer(0, 2**53)),
+}
+"""Their keys."""
+
+
+def read(text: str | bytes, client: str = "") -> Any:
+    """Read a message from the page: an instance of one of the classes in :data:`MESSAGES`.
 
     BadMessageError if it is not JSON, of no known type, or has unusable values.
     """
@@ -212,32 +232,18 @@ def read(text: str | bytes, client: str = "") -> Edit | Pick | Choose | Open | A
     except (ValueError, RecursionError):
         raise BadMessageError("got something else, expected JSON") from None
     kind = found.get("type") if isinstance(found, dict) else None
-    try:
-        if kind == "document":
-            phase = Choice(*PHASES)(found.get("phase", "done"))
-            number = _COUNT(found.get("number", 0))
-            painting = _COUNT(found.get("painting", 0))
-            return Edit(document(found.get("document")), phase, client, number, painting)
-        if kind == "pick":
-            x, y = (Number(0, 1)(found.get(name)) for name in "xy")
-            light = Integer(-1, 100)(found.get("light", -1))
-            view = _COUNT(found.get("view", 0))
-            of = Choice(*PICKED)(found.get("of", "highlight"))
-            number = _COUNT(found.get("number", 0))
-            point = tuple(_POINT(found["point"])) if found.get("point") else ()
-            return Pick(x, y, light, number, client, view, of, point)
-        if kind == "open":
-            return Open(String(least=1)(found.get("name")), String()(found.get("envmap", "")))
-        if kind == "choose":
-            return Choose(_COUNT(found.get("explanation")))
-        if kind == "look":
-            return ApplyLook(String()(found.get("name")), String()(found.get("text")))
-    except WantedError as error:
-        raise BadMessageError(f"{kind}: expected {error}") from None
-    if kind in ("sky", "save"):
-        return Sky() if kind == "sky" else Save()
-    wanted = "expected document, pick, choose, open, look, sky or save"
-    raise BadMessageError(f"type: got {show(kind)[:80]}, {wanted}")
+    if not isinstance(kind, str) or kind not in MESSAGES:
+        raise BadMessageError(f"type: got {show(kind)[:80]}, expected one of {', '.join(MESSAGES)}")
+    values: dict[str, Any] = {}
+    for key in fields(MESSAGES[kind]):
+        if key.name == "client":
+            values[key.name] = client
+        elif key.name in found or key.default is MISSING:
+            try:
+                values[key.name] = _CHECKS[key.name](found.get(key.name))
+            except WantedError as error:
+                raise BadMessageError(f"{kind}: expected {error}") from None
+    return MESSAGES[kind](**values)
 
 
 def _refused(name):

@@ -313,8 +313,10 @@ class Session:
             self._search()
         elif not solution.converged:
             self._step()
+        elif settled and solution.hold_more():
+            self.status["hold"], self._rendered = solution.hold, None
         else:
-            return settled and self._hold_more()
+            return False
         return True
 
     @property
@@ -352,13 +354,6 @@ class Session:
         if self.solution.run is not before:
             self._rendered = None
         self._tell_solution()
-
-    def _hold_more(self):
-        """Give more weight to what was not painted, if that is due."""
-        if not self.solution.hold_more():
-            return False
-        self.status["hold"], self._rendered = self.solution.hold, None
-        return True
 
     def _tell_explanations(self):
         """Show the explanations of the paint in the pages."""
@@ -437,9 +432,8 @@ class Session:
         request = solution.request
         white = self.transport.linear(tensor(np.ones_like(self.map))).numpy()
         lamps = self.transport.apply(tensor(np.zeros_like(self.map))).numpy()
-        light = advice.Light(white, lamps)
         rendering, alone = solution.point.rendering, solution.coverages()
-        text, actions = advice.said(document, request, rendering, self.reach, alone, light)
+        text, actions = advice.said(document, request, rendering, self.reach, alone, white, lamps)
         if text:
             self.advised = False
             self._tell_doing("looking for a better place of the light")
@@ -650,9 +644,8 @@ class Session:
     def _carried_out(self, settings, folder, stage):
         """Carry a configuration out as `envedit run` does; returns the result, and warnings of its files."""
         base = self.project.base
-        with output_folder.alone(folder):
-            read = output_folder.inputs_of(settings, base)
-            output_folder.prepare_folder(folder, output_folder.names(folder), read)
+        read = output_folder.inputs_of(settings, base)
+        with output_folder.results_in(folder, output_folder.names(folder), read):
             watch = pipeline.Watch(stage, self._progress)
             result = pipeline.run(settings, folder=folder, base=base, watch=watch)
             stage("writing")

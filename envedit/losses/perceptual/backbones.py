@@ -10,7 +10,6 @@ import mitsuba as mi
 import numpy as np
 
 from envedit.core.arrays import tensor
-from envedit.core.errors import InputError
 from envedit.core.types import DrArray, FilePath, Shape
 from envedit.losses.perceptual import convolution, weights
 
@@ -79,7 +78,7 @@ class Backbone:
     """
 
     def __init__(self, kind: str, tensors: dict[str, np.ndarray]):
-        self.title, self.layers, self.least_size, _, _ = KINDS[kind]
+        _, self.layers, self.least_size, _, _ = KINDS[kind]
         self.channels = [layer.outputs for layer in self.layers if isinstance(layer, Conv) and layer.tap]
         self.weights: list[Any] = [
             _as_matrix(layer, tensors) if isinstance(layer, Conv) else None for layer in self.layers
@@ -99,16 +98,11 @@ class Backbone:
         return cls(kind, weights.read(file, shapes, words, source))
 
     def stack(self, height: int, width: int, pooling: str = "max") -> Stack:
-        """Lay the network out for images of one size; InputError if nothing would be left of them.
+        """Lay the network out for images of one size.
 
-        ``pooling`` is "max", or "hanning" for the L2 pooling of DISTS in place of every max pooling, which
-        takes images of any size.
+        ``pooling`` is "max", of images with ``least_size`` pixels or more along each side, or "hanning" for
+        the L2 pooling of DISTS in place of every max pooling.
         """
-        if pooling == "max" and min(height, width) < self.least_size:
-            raise InputError(
-                f"image of {height} rows and {width} columns: too small for {self.title}; "
-                f"it needs {self.least_size} of each."
-            )
         return Stack(self, height, width, pooling)
 
 

@@ -9,19 +9,18 @@ pixels and holds some 140 MB beside the weights, which are not part of the packa
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from envedit.core.arrays import tensor
 from envedit.core.errors import InputError
 from envedit.core.types import DrArray, FilePath, Shape, Tensor
-from envedit.losses.metrics import checked
 from envedit.losses.perceptual import weights
 from envedit.losses.perceptual.backbones import Backbone
 from envedit.losses.perceptual.convolution import Divisor
-from envedit.losses.ssim import KnownGradient, check_image
+from envedit.losses.ssim import KnownGradient
 
 DISTS_SOURCE = "https://github.com/dingkeyan93/DISTS, DISTS_pytorch/weights.pt"
 LPIPS_SOURCE = "https://github.com/richzhang/PerceptualSimilarity, lpips/weights/v0.1/{}.pth"
@@ -36,19 +35,6 @@ MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 
 # ---- Images ------------------------------------------------------------------------------------------------
-
-
-def _check(image: Tensor, name: str) -> None:
-    """Refuse what is not an image ``(H, W, 3)``."""
-    check_image(image, name)
-    if image.shape[2] != 3:
-        raise InputError(f"{name}: expected an image of shape (H, W, 3), got {tuple(image.shape)}.")
-
-
-def _single(image: Any, name: str) -> mi.TensorXf:
-    """Return an image, array or tensor, in single precision; errors as of :func:`.metrics.checked`."""
-    image = np.ascontiguousarray(checked(image, name), np.float32)
-    return mi.TensorXf(image)
 
 
 def _normalised(x: DrArray) -> DrArray:
@@ -101,25 +87,18 @@ class Dists:
         ]
 
     def against(self, reference: Tensor) -> Callable[[Tensor], DrArray]:
-        """Return the distance to an image ``(H, W, 3)``: ``x -> size-1 array``, differentiable in x."""
-        return _DistsTo(self, reference)
+        """Return the distance to an image ``(H, W, 3)``: ``x -> size-1 array``, differentiable in x.
 
-    def __call__(self, x: Tensor, reference: Tensor) -> DrArray:
-        """Return the distance of two images as a size-1 array; as of :meth:`against`."""
-        return self.against(reference)(x)
+        The image itself is not differentiated.
+        """
+        return _DistsTo(self, reference)
 
 
 class _DistsTo:
     """The distance to a fixed image: value, and gradient by hand."""
 
     def __init__(self, dists, reference):
-        _check(reference, "DISTS: reference")
-        if dr.grad_enabled(reference):
-            raise InputError(
-                "DISTS: gradients of the reference are not available: swap the two, or detach it."
-            )
-        self.shape = tuple(reference.shape)
-        self._stack = dists.backbone.stack(self.shape[0], self.shape[1], "hanning")
+        self._stack = dists.backbone.stack(reference.shape[0], reference.shape[1], "hanning")
         self._weights = dists.weights
         self._reference = []
         for y, channels in self._features(dr.detach(reference.array))[0]:
@@ -127,8 +106,6 @@ class _DistsTo:
             self._reference.append((y, mean, _variances(y, mean)))
 
     def __call__(self, x: Tensor) -> DrArray:
-        if tuple(x.shape) != self.shape:
-            raise InputError(f"DISTS: image {tuple(x.shape)} and reference {self.shape} differ in shape.")
         if not dr.grad_enabled(x):
             return self._evaluate(dr.detach(x.array), False)[0]
         return dr.custom(KnownGradient, x.array, self)
@@ -209,22 +186,12 @@ class Lpips:
         read = weights.read(heads_file, shapes, f"the heads of LPIPS ({kind})", LPIPS_SOURCE.format(kind))
         self.heads = [dr.opaque(mi.Float(read[name].ravel())) for name in shapes]
 
-    def __call__(self, a: Any, b: Any) -> float:
-        """Compare two images ``(H, W, 3)``, arrays or tensors, in single precision.
-
-        InputError if they differ in shape, are too small for the network, or hold values that are not finite
-        or so large that their features are not.
-        """
-        a, b = (_single(image, f"LPIPS: {name} image") for image, name in ((a, "first"), (b, "second")))
-        distance = float(self.distance(a, b)[0])
-        if not np.isfinite(distance):
-            raise InputError("LPIPS: the images hold values too large to compare; give display values.")
-        return distance
+    def __call__(self, a: np.ndarray, b: np.ndarray) -> float:
+        """Compare two images ``(H, W, 3)`` in single precision."""
+        return float(self.distance(tensor(a), tensor(b))[0])
 
     def distance(self, a: Tensor, b: Tensor) -> DrArray:
         """Return the distance of two images ``(H, W, 3)`` in their precision, as a size-1 array."""
-        if a.shape != b.shape:
-            raise InputError(f"LPIPS: images {tuple(a.shape)} and {tuple(b.shape)} differ in shape.")
         stack = self.backbone.stack(a.shape[0], a.shape[1], "max")
         features = [stack.taps(stack.forward(_normalised(image.array))) for image in (a, b)]
         score = mi.Float64(0)

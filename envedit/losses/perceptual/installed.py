@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from envedit import config
@@ -26,19 +25,14 @@ STEPS_WITH_DISTS = 300
 """``optimizer.iterations`` at "auto" with DISTS; without it, as for other maps of many parameters."""
 
 
-def folder() -> Path | None:
-    """Return the folder in which every run looks for weights, in that of the caches; None: there is none."""
-    return cache_folder("weights")
-
-
 def files(settings: config.Config) -> dict[str, str]:
     """Return the weight files that a configuration uses: backbone and heads, vgg and dists.
 
     Files that it names come first, then those of the folder that it names, whether they are there or not,
-    then those of :func:`folder`, where both of a pair are. What is missing is not in the table.
+    then those in the folder of caches, where both of a pair are. What is missing is not in the table.
     """
     named = settings.perceptual
-    chosen = named.weights or folder()
+    chosen = named.weights or cache_folder("weights")
     pairs = {("backbone", "heads"): (BACKBONES[named.network], HEADS.format(named.network))}
     if settings.loss.dists:
         pairs["vgg", "dists"] = VGG, DISTS

@@ -7,10 +7,9 @@ export const clamp = (value, least, most) => Math.max(least, Math.min(most, valu
 // To the right, and upwards.
 export const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
 
-export function button(testid, content, attributes, act = () => {}) {
-  const made = Object.assign(document.createElement("button"), attributes);
+export function button(id, content, attributes, act = () => {}) {
+  const made = Object.assign(document.createElement("button"), { id, ...attributes });
   made.append(content);
-  made.dataset.testid = testid;
   made.addEventListener("click", act);
   return made;
 }

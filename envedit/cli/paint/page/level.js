@@ -1,6 +1,6 @@
 // The level of the map: its equator as a line, with a grip in the middle (horizon) and one at the right (tilt).
 
-import { ARROWS, clamp, consume, follow } from "./elements.js";
+import { $, ARROWS, clamp, consume, follow } from "./elements.js";
 import { seen } from "./orientation.js";
 
 const GRIPS = { // which degrees it changes, which way upwards is, and where on the equator of the file it is
@@ -10,20 +10,19 @@ const GRIPS = { // which degrees it changes, which way upwards is, and where on 
 const STEP = 0.5, LARGE_STEP = 5; // degrees of an arrow key
 
 export class Level {
-  constructor(stack, holder, button, on) {
-    Object.assign(this, { stack, holder, button, on }); // on: document(), preview(change), done(change)
-    this.curve = holder.querySelector("polyline");
-    this.grips = Object.fromEntries([...holder.querySelectorAll("[data-grip]")].map((grip) => [grip.dataset.grip, grip]));
-    for (const [name, grip] of Object.entries(this.grips)) {
-      grip.addEventListener("pointerdown", (event) => this.drag(event, name));
-      grip.addEventListener("keydown", (event) => this.key(event, name));
+  constructor(on) {
+    Object.assign(this, { holder: $("level-line"), on }); // on: document(), preview(change), done(change)
+    for (const name of Object.keys(GRIPS)) {
+      $(`grip-${name}`).addEventListener("pointerdown", (event) => this.drag(event, name));
+      $(`grip-${name}`).addEventListener("keydown", (event) => this.key(event, name));
     }
-    button.addEventListener("click", () => this.toggle());
+    $("level").addEventListener("click", () => this.toggle());
   }
 
   toggle() {
-    this.holder.hidden = !this.holder.hidden;
-    this.button.ariaPressed = String(!this.holder.hidden);
+    const hidden = !this.holder.hidden;
+    this.holder.hidden = $("level-degrees").hidden = $("level-hint").hidden = hidden;
+    $("level").ariaPressed = String(!hidden);
     this.draw();
   }
 
@@ -36,7 +35,7 @@ export class Level {
   drag(event, name) {
     if (event.button !== 0) return;
     consume(event);
-    const grip = this.grips[name], start = event.clientY, height = this.stack.getBoundingClientRect().height;
+    const grip = event.currentTarget, start = event.clientY, height = $("map-stack").getBoundingClientRect().height;
     const before = this.on.document()[GRIPS[name].key];
     let change = null;
     grip.focus();
@@ -57,9 +56,9 @@ export class Level {
     if (this.holder.hidden) return;
     const equator = Array.from({ length: 145 }, (_, i) => seen(document, { azimuth: 2.5 * i, elevation: 0 }));
     equator.sort((a, b) => a.azimuth - b.azimuth);
-    this.curve.setAttribute("points", equator.map(({ azimuth, elevation }) => `${azimuth},${90 - elevation}`).join(" "));
+    this.holder.querySelector("polyline").setAttribute("points", equator.map(({ azimuth, elevation }) => `${azimuth},${90 - elevation}`).join(" "));
     for (const [name, { key, azimuth }] of Object.entries(GRIPS)) {
-      const grip = this.grips[name], at = seen(document, { azimuth, elevation: 0 }), degrees = document[key];
+      const grip = $(`grip-${name}`), at = seen(document, { azimuth, elevation: 0 }), degrees = document[key];
       grip.style.left = `${at.azimuth / 3.6}%`;
       grip.style.top = `${(90 - at.elevation) / 1.8}%`;
       Object.assign(grip, { ariaValueNow: degrees, ariaValueText: `${degrees} degrees` });

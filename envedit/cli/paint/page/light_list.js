@@ -28,8 +28,7 @@ export class LightList {
   row(i) {
     const cell = (name, text, title, act) => button(`list-${name}-${i + 1}`, text, { title, ariaLabel: `${name} light ${i + 1}` }, act);
     const control = (name, made, attributes) => {
-      Object.assign(made, { ariaLabel: `${name} of light ${i + 1}`, ...attributes });
-      made.dataset.testid = `list-${name}-${i + 1}`;
+      Object.assign(made, { id: `list-${name}-${i + 1}`, ariaLabel: `${name} of light ${i + 1}`, ...attributes });
       made.addEventListener("focus", () => this.lights.choose(i));
       return made;
     };

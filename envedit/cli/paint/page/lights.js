@@ -1,26 +1,25 @@
 // The lights of the map as handles, and the panel of the one that is chosen.
 // Entries are as in [[input.lights]]: with `light` one of the map's own, with factors; without it an added one.
 
-import { ARROWS, button, clamp, consume, follow } from "./elements.js";
+import { $, ARROWS, button, clamp, consume, follow } from "./elements.js";
 import { seen, unseen } from "./orientation.js";
 
 export class Lights {
-  constructor(stack, holder, panel, on) {
-    Object.assign(this, { stack, holder, panel, on }); // on: document(), preview(change), done(change)
+  constructor(on) {
+    Object.assign(this, { stack: $("map-stack"), holder: $("handles"), on }); // on: document(), preview(change), done(change)
     this.own = [];
     this.found = [];
     this.chosen = -1;
     this.turning = false;
     this.draft = null;
     this.solo = -1;
-    holder.addEventListener("pointerdown", (e) => this.turn(e));
-    panel.flux.addEventListener("input", () => this.change("flux"));
-    panel.color.addEventListener("input", () => this.change("flux"));
-    panel.size.addEventListener("input", () => this.change("size"));
-    for (const key of SHAPED) panel[key].addEventListener("input", () => this.change(key));
-    for (const input of [panel.flux, panel.color, panel.size, ...SHAPED.map((key) => panel[key])]) input.addEventListener("change", () => this.commit());
-    panel.mute.addEventListener("click", () => this.mute());
-    panel.remove.addEventListener("click", () => this.remove());
+    this.holder.addEventListener("pointerdown", (e) => this.turn(e));
+    for (const key of ["flux", "color", "size", ...SHAPED]) {
+      $(`light-${key}`).addEventListener("input", () => this.change(key));
+      $(`light-${key}`).addEventListener("change", () => this.commit());
+    }
+    $("light-mute").addEventListener("click", () => this.mute());
+    $("light-delete").addEventListener("click", () => this.remove());
   }
 
   set(message) {
@@ -122,7 +121,7 @@ export class Lights {
   wheel(event, index) {
     event.preventDefault();
     this.choose(index);
-    const input = event.shiftKey ? this.panel.size : this.panel.flux;
+    const input = $(event.shiftKey ? "light-size" : "light-flux");
     input.value = Number(input.value) - Math.sign(event.deltaY || event.deltaX) * 0.2;
     input.dispatchEvent(new Event("input"));
     clearTimeout(this.later);
@@ -154,13 +153,15 @@ export class Lights {
   change(what) {
     const light = this.list()[this.chosen];
     if (!light) return;
-    const { flux, color, size } = this.panel;
-    const tint = linear(color.value), most = Math.max(...tint, 1e-3);
-    const strength = 2 ** Number(flux.value) * (light.own ? 1 : this.unit);
-    let next = { [what]: Number(this.panel[what].value) }; // aspect, rotation, softness
-    if (what === "flux") next = { flux: tint.map((v) => Math.min(1e6, (v / most) * strength)) };
-    if (what === "size") next = { size: Math.min(mostSize(light), round(2 ** Number(size.value))) };
-    if (what === "shape") next = { shape: this.panel.shape.value, aspect: aspectOf(this.panel.shape.value), image: undefined };
+    const { value } = $(`light-${what}`);
+    let next = { [what]: Number(value) }; // aspect, rotation, softness
+    if (what === "flux" || what === "color") {
+      const tint = linear($("light-color").value), most = Math.max(...tint, 1e-3);
+      const strength = 2 ** Number($("light-flux").value) * (light.own ? 1 : this.unit);
+      next = { flux: tint.map((v) => Math.min(1e6, (v / most) * strength)) };
+    }
+    if (what === "size") next = { size: Math.min(mostSize(light), round(2 ** Number(value))) };
+    if (what === "shape") next = { shape: value, aspect: aspectOf(value), image: undefined };
     this.preview(this.chosen, next);
   }
 
@@ -240,7 +241,7 @@ export class Lights {
     });
     this.holder.querySelectorAll(".found").forEach((ring) => ring.remove());
     const solved = !this.draft && document.strokes.length > 0;
-    this.panel.hint.hidden = !solved || !this.found.length;
+    $("ring-hint").hidden = !solved || !this.found.length;
     if (solved) for (const light of this.found) {
       const ring = Object.assign(window.document.createElement("span"), { className: "found", title: "where the solution has this light" });
       place(ring, light);
@@ -251,28 +252,28 @@ export class Lights {
   }
 
   fill(light) {
-    const { set, name, flux, color, size, mute, remove, fluxValue, sizeValue, shaped, shape, aspect, rotation, softness } = this.panel;
-    set.disabled = !light;
-    shaped.hidden = !light || Boolean(light.own);
-    name.textContent = light ? `${light.own ? "Light of the map" : "Added light"} ${this.chosen + 1}` : "No light chosen";
-    if (!light) fluxValue.textContent = sizeValue.textContent = "";
+    $("light").disabled = !light;
+    $("light-shaped").hidden = !light || Boolean(light.own);
+    $("light-name").textContent = light ? `${light.own ? "Light of the map" : "Added light"} ${this.chosen + 1}` : "No light chosen";
+    if (!light) $("light-flux-value").textContent = $("light-size-value").textContent = "";
     if (!light) return;
     const most = Math.max(...light.entry.flux), muted = off(light);
     if (most > 0) {
-      flux.value = Math.log2(most / (light.own ? 1 : this.unit));
-      color.value = hex(light.entry.flux.map((v) => v / most));
+      $("light-flux").value = Math.log2(most / (light.own ? 1 : this.unit));
+      $("light-color").value = hex(light.entry.flux.map((v) => v / most));
     }
-    size.max = light.own ? 4 : 6.5;
-    size.value = Math.log2(light.entry.size);
-    shape.value = light.entry.shape ?? "gaussian";
-    aspect.value = light.entry.aspect ?? aspectOf(shape.value);
-    rotation.value = light.entry.rotation ?? 0;
-    softness.value = light.entry.softness ?? 0;
-    softness.disabled = shape.value === "gaussian";
-    fluxValue.textContent = muted ? "off" : `${signed(stops(light, this.unit))} st`;
-    sizeValue.textContent = `${+degrees(light).toPrecision(2)}°`;
-    mute.ariaPressed = String(muted);
-    remove.disabled = Boolean(light.own);
+    $("light-size").max = light.own ? 4 : 6.5;
+    $("light-size").value = Math.log2(light.entry.size);
+    const shape = light.entry.shape ?? "gaussian";
+    $("light-shape").value = shape;
+    $("light-aspect").value = light.entry.aspect ?? aspectOf(shape);
+    $("light-rotation").value = light.entry.rotation ?? 0;
+    $("light-softness").value = light.entry.softness ?? 0;
+    $("light-softness").disabled = shape === "gaussian";
+    $("light-flux-value").textContent = muted ? "off" : `${signed(stops(light, this.unit))} st`;
+    $("light-size-value").textContent = `${+degrees(light).toPrecision(2)}°`;
+    $("light-mute").ariaPressed = String(muted);
+    $("light-delete").disabled = Boolean(light.own);
   }
 }
 

@@ -8,7 +8,7 @@ import { $, button } from "./elements.js";
 import { EMPTY, History } from "./history.js";
 import { Level } from "./level.js";
 import { LightList } from "./light_list.js";
-import { hex, Lights, linear } from "./lights.js";
+import { Lights, linear } from "./lights.js";
 import { Regions } from "./regions.js";
 import { Strokes } from "./strokes.js";
 import { Zoom } from "./zoom.js";
@@ -123,7 +123,7 @@ function tabs(names) {
   view = Math.min(view, names.length - 1);
   $("views").hidden = names.length < 2;
   $("views").replaceChildren(...names.map((name, i) => {
-    const tab = button(`view-${i}`, name, { id: `view-${i}`, role: "tab" }, () => chooseView(i));
+    const tab = button(`view-${i}`, name, { role: "tab" }, () => chooseView(i));
     tab.setAttribute("aria-controls", "render-stack");
     tab.addEventListener("keydown", (event) => {
       const step = { ArrowRight: 1, ArrowLeft: -1 }[event.key];
@@ -296,14 +296,14 @@ function viewed(stroke) {
 // A highlight or a shadow is dragged: first ask whose it is, then where that light must go. A drag is one step of
 // history: it ends with the answer to the last question, or after UNANSWERED where none comes.
 const UNANSWERED = 5000;
-let dragged = tool, picked = -1, point = [], place = null, asked = 0, answered = 0, ended = false, unanswered = 0, held = null;
+let dragged = tool, picked = -1, point, place = null, asked = 0, answered = 0, ended = false, unanswered = 0, held = null;
 function pick(phase, x, y, event) {
   if (phase === "start") dragged = tool; // another may be chosen before all is answered
   const placing = PICKS[dragged][1];
   if (phase === "start") {
     clearTimeout(unanswered);
     picked = placing && lights.list()[lights.chosen] ? lights.chosen : -1;
-    point = [];
+    point = undefined;
     place = held = null;
     ended = false;
   }
@@ -335,7 +335,7 @@ RECEIVED.picked = (message) => {
   } else if (message.text) say(`Light not moved: ${message.text}`);
   else if (message.azimuth === undefined) {
     picked = message.light;
-    point = message.point ?? [];
+    point = message.point;
     if (picked < 0) say("No light of the map lights this pixel: add one, or paint");
     else {
       lights.choose(picked);
@@ -354,7 +354,7 @@ RECEIVED.picked = (message) => {
 
 // Whose light a pixel shows, in words: lights that give 1 % of it or more, and the rest of the map.
 function madeBy(shares) {
-  const listed = lights.list(), percent = (share) => `${Math.round(100 * share)} %`;
+  const listed = lights.list();
   const named = (i) => i < 0 ? "a light added by paint" : `light ${i + 1}${listed[i]?.entry.name ? ` (${listed[i].entry.name})` : ""}`;
   const parts = shares.filter(([, share]) => share >= 0.01).sort((a, b) => b[1] - a[1]);
   const rest = 1 - parts.reduce((sum, [, share]) => sum + share, 0);
@@ -367,17 +367,9 @@ const edits = {
   preview: (change) => history.preview(change, "dragging"),
   done: (change) => history.push(change),
 };
-const lights = new Lights($("map-stack"), $("handles"), {
-  set: $("light"), name: $("light-name"), flux: $("light-flux"), color: $("light-color"), size: $("light-size"),
-  shaped: $("light-shaped"), shape: $("light-shape"), aspect: $("light-aspect"), rotation: $("light-rotation"), softness: $("light-softness"),
-  mute: $("light-mute"), remove: $("light-delete"), hint: $("ring-hint"), fluxValue: $("light-flux-value"), sizeValue: $("light-size-value"),
-}, {
-  ...edits,
-  back: () => send(history.document, "done"),
-  drawn: (all) => listed.draw(all),
-});
+const lights = new Lights({ ...edits, back: () => send(history.document, "done"), drawn: (all) => listed.draw(all) });
 const listed = new LightList($("light-list"), lights);
-const level = new Level($("map-stack"), $("level-line"), $("level"), {
+const level = new Level({
   ...edits,
   preview(change) {
     lights.draft = { ...history.document, ...change };
@@ -387,24 +379,7 @@ const level = new Level($("map-stack"), $("level-line"), $("level"), {
     orient(lights.draft);
   },
 });
-const regions = new Regions($("map-stack"), $("handles"), $("regions"), {
-  button: $("region"), set: $("region-panel"), action: $("region-action"), radius: $("region-radius"), softness: $("region-softness"),
-  scaled: $("region-scaled"), list: $("region-list"), remove: $("region-remove"),
-  inputs: ["action", "radius", "softness", "stops", "color"].map((name) => $(`region-${name}`)),
-}, {
-  ...edits,
-  factor() {
-    const tint = linear($("region-color").value), most = Math.max(...tint, 1e-3);
-    return tint.map((v) => Number(((v / most) * 2 ** Number($("region-stops").value)).toPrecision(5)));
-  },
-  show(factor) {
-    const most = Math.max(...factor);
-    if (!most) return; // black has no colour
-    $("region-stops").value = Math.round(100 * Math.log2(most)) / 100;
-    $("region-color").value = hex(factor.map((v) => v / most));
-  },
-});
-$("level").addEventListener("click", () => { $("level-degrees").hidden = $("level-hint").hidden = $("level-line").hidden; });
+const regions = new Regions(edits);
 
 // ---- controls
 
@@ -590,7 +565,7 @@ function open(name, envmap = $("open-map").value.trim()) {
   state("loading", `Opening ${name}`);
   connection.send({ type: "open", name, envmap });
 }
-$("open").addEventListener("submit", (event) => { event.preventDefault(); open($("open-name").value.trim()); });
+$("open-form").addEventListener("submit", (event) => { event.preventDefault(); open($("open-name").value.trim()); });
 
 async function upload(file) {
   state("loading", `Taking ${file.name}`);

@@ -1,17 +1,20 @@
 // Regions of the map as in [[input.regions]]: painted by a brush, shown over the map, and changed in a panel.
 
-import { ARROWS, button, clamp, consume, follow } from "./elements.js";
+import { $, ARROWS, button, clamp, consume, follow } from "./elements.js";
+import { hex, linear } from "./lights.js";
 import { direction, unseen } from "./orientation.js";
 
 const WIDTH = 256, HEIGHT = 128; // pixels of what is shown over the map
 const COLOURS = { keep: [90, 230, 120], scale: [110, 170, 255], fill: [255, 120, 90] };
 const NAMES = { keep: "keep", scale: "dim or tint", fill: "fill" };
 const MOST_POINTS = 500; // as config/region_schema.py has it
+const INPUTS = ["action", "radius", "softness", "stops", "color"].map((name) => `region-${name}`);
 const RADIANS = Math.PI / 180;
 
 export class Regions {
-  constructor(stack, holder, canvas, panel, on) {
-    Object.assign(this, { stack, holder, canvas, panel, on }); // on: document(), preview(change), done(change), factor(), show(factor)
+  constructor(on) {
+    Object.assign(this, { holder: $("handles"), canvas: $("regions"), on }); // on: document(), preview(change), done(change)
+    const { holder, canvas } = this;
     this.context = canvas.getContext("2d");
     this.chosen = -1;
     this.cursor = null;
@@ -20,9 +23,9 @@ export class Regions {
     holder.addEventListener("pointermove", (event) => this.hover(event));
     holder.addEventListener("pointerleave", () => { this.cursor = null; this.draw(); });
     canvas.addEventListener("keydown", (event) => this.key(event));
-    panel.button.addEventListener("click", () => this.toggle());
-    panel.remove.addEventListener("click", () => this.remove());
-    for (const input of panel.inputs) {
+    $("region").addEventListener("click", () => this.toggle());
+    $("region-remove").addEventListener("click", () => this.remove());
+    for (const input of INPUTS.map($)) {
       input.addEventListener("input", () => this.change(false));
       input.addEventListener("change", () => this.change(true));
     }
@@ -32,8 +35,8 @@ export class Regions {
   list() { return this.on.document().regions ?? []; }
 
   toggle() {
-    this.canvas.hidden = this.panel.set.hidden = this.active;
-    this.panel.button.ariaPressed = String(this.active);
+    this.canvas.hidden = $("region-panel").hidden = this.active;
+    $("region").ariaPressed = String(this.active);
     this.holder.classList.toggle("brushing", this.active);
     this.points = this.cursor = null;
     this.draw();
@@ -41,18 +44,22 @@ export class Regions {
 
   // What the panel is set to: keys of a region without its place.
   settings() {
-    const { action, softness } = this.panel;
-    return {
-      action: action.value, softness: Number(softness.value),
-      factor: action.value === "scale" ? this.on.factor() : undefined,
-    };
+    const action = $("region-action").value;
+    return { action, softness: Number($("region-softness").value), factor: action === "scale" ? this.factor() : undefined };
+  }
+  get radius() { return Number($("region-radius").value); }
+
+  // What light of a region is multiplied by, from the panel.
+  factor() {
+    const tint = linear($("region-color").value), most = Math.max(...tint, 1e-3);
+    return tint.map((v) => Number(((v / most) * 2 ** Number($("region-stops").value)).toPrecision(5)));
   }
 
   // ---- the brush
 
   // The place of the file under a pointer, [azimuth, elevation].
   at(event) {
-    const box = this.stack.getBoundingClientRect();
+    const box = $("map-stack").getBoundingClientRect();
     return this.place(360 * clamp((event.clientX - box.x) / box.width, 0, 1), 90 - 180 * clamp((event.clientY - box.y) / box.height, 0, 1));
   }
   place(azimuth, elevation) {
@@ -77,11 +84,11 @@ export class Regions {
   begin(place) { this.points = [place]; this.draw(); }
   go(place) {
     const far = angle(toward(this.points.at(-1)), toward(place)) / RADIANS;
-    if (far >= Math.max(0.25, Number(this.panel.radius.value) / 4) && this.points.length < MOST_POINTS) this.points.push(place);
+    if (far >= Math.max(0.25, this.radius / 4) && this.points.length < MOST_POINTS) this.points.push(place);
   }
   end() {
     if (!this.points) return;
-    const region = { ...this.settings(), points: this.points, radius: Number(this.panel.radius.value) };
+    const region = { ...this.settings(), points: this.points, radius: this.radius };
     this.points = null;
     this.on.done({ regions: [...this.list(), region] });
     this.choose(this.list().length - 1);
@@ -109,12 +116,16 @@ export class Regions {
 
   choose(index) {
     this.chosen = index;
-    const region = this.list()[index], { action, radius, softness } = this.panel;
+    const region = this.list()[index];
     if (region) {
-      action.value = region.action;
-      softness.value = region.softness ?? 0;
-      if (region.radius) radius.value = region.radius;
-      if (region.factor) this.on.show(region.factor);
+      $("region-action").value = region.action;
+      $("region-softness").value = region.softness ?? 0;
+      if (region.radius) $("region-radius").value = region.radius;
+      const most = Math.max(0, ...(region.factor ?? []));
+      if (most) { // black has no colour
+        $("region-stops").value = Math.round(100 * Math.log2(most)) / 100;
+        $("region-color").value = hex(region.factor.map((v) => v / most));
+      }
     }
     this.draw();
   }
@@ -122,13 +133,13 @@ export class Regions {
   // The chosen region is changed, if there is one; what is painted next will be so in any case.
   change(done) {
     const region = this.list()[this.chosen];
-    if (this.panel.inputs.some((input) => !input.checkValidity())) {
+    if (INPUTS.map($).some((input) => !input.checkValidity())) {
       if (done) this.choose(this.chosen);
       return;
     }
     if (region) {
       const changed = { ...region, ...this.settings() };
-      if (region.points) changed.radius = Number(this.panel.radius.value);
+      if (region.points) changed.radius = this.radius;
       const regions = this.list().map((one) => (one === region ? changed : one));
       if (done) this.on.done({ regions });
       else this.on.preview({ regions });
@@ -144,7 +155,7 @@ export class Regions {
   }
 
   draw() {
-    const regions = this.list(), { list, remove, scaled } = this.panel;
+    const regions = this.list(), list = $("region-list");
     if (!regions[this.chosen]) this.chosen = -1;
     while (list.children.length > regions.length) list.lastChild.remove();
     regions.forEach(({ action }, i) => {
@@ -152,8 +163,8 @@ export class Regions {
       chip.textContent = `${i + 1} ${NAMES[action]}`;
       chip.ariaPressed = String(i === this.chosen);
     });
-    remove.disabled = this.chosen < 0;
-    scaled.hidden = this.panel.action.value !== "scale";
+    $("region-remove").disabled = this.chosen < 0;
+    $("region-scaled").hidden = $("region-action").value !== "scale";
     if (this.active) this.shade(regions);
   }
 
@@ -173,7 +184,7 @@ export class Regions {
       }
     };
     regions.forEach((region, i) => over(COLOURS[region.action], this.weights(region, i === this.chosen ? 0.65 : 0.4)));
-    const now = { ...this.settings(), radius: Number(this.panel.radius.value) };
+    const now = { ...this.settings(), radius: this.radius };
     const points = this.points ?? (this.cursor ? [this.cursor] : null);
     if (points) over(COLOURS[now.action], weightsOf(directions, { ...now, points }, this.points ? 0.65 : 0.3));
     this.context.putImageData(image, 0, 0);

@@ -173,33 +173,6 @@ def test_a_step_that_is_taken_back_leaves_the_moments():
     assert all(np.array_equal(state[key], moved[key]) for key in ("m/p", "v/p", "step"))
 
 
-class Steep:
-    """Radiance is exp(x), with nothing that holds x: a long step ends in infinity."""
-
-    lr = 0.01
-
-    def encode(self, image, seed=0):
-        return {"log": dr.opaque(mi.TensorXf(np.log(image)))}
-
-    def decode(self, params):
-        return dr.exp(params["log"])
-
-
-@pytest.mark.slow
-def test_a_learning_rate_that_overflows_is_lowered_until_it_does_not():
-    """Without going back the parameters would stay where the radiance is infinite, whatever the rate."""
-    arguments, _ = case(np.random.default_rng(0), iterations=80)
-    _, _, renderer, objective, original, first, _ = arguments
-    steep = Steep()
-    settings = config.Optimizer(iterations=80, lr=2000.0, schedule="cosine")
-    adam, state = optimizer.Adam(steep.encode(original[:3]), 2000.0, (0.9, settings.beta2)), adam_loop.State()
-    params, state = adam_loop.optimise(
-        steep, adam.params, renderer, objective, original, first, settings, adam=adam, state=state
-    )
-    assert 4 <= state.bad_steps < 40 and state.step == 80
-    assert np.isfinite(steep.decode(params).numpy()).all()
-
-
 # ---- an edit in progress ---------------------------------------------------------------------------------
 
 

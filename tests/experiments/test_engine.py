@@ -49,11 +49,6 @@ def test_what_does_not_hold_is_named(table, row, changes, says):
     assert len(wrong) == 1 and wrong[0].startswith("x: ") and says in wrong[0]
 
 
-def test_numbers_have_three_digits():
-    assert [tables.si(v, "B") for v in (None, 0, 999, 1.234e9)] == ["-", "0 B", "999 B", "1.23 GB"]
-    assert [tables.seconds(v) for v in (None, 0.0123, 1200)] == ["-", "12.3 ms", "1200 s"]
-
-
 @pytest.mark.slow
 def test_figures_are_drawn_of_what_there_is(tmp_path):
     size = {"table": "scaling", "pixels": 16, "texels": [8, 16], "spp": 16, "again_s": 1.0, "apply_s": 0.1}

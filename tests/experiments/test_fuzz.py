@@ -14,7 +14,7 @@ import pytest
 from envedit.config import Config
 from envedit.core.errors import InputError
 from envedit.images import images
-from experiments.fuzz import damage, experiment, kinds, whole
+from experiments.fuzz import experiment, kinds, whole
 from experiments.fuzz.declared import declared as declared_bytes
 from experiments.fuzz.worker import Worker
 from experiments.harness import Case, Done, rows_of, table
@@ -233,11 +233,3 @@ def test_images_say_how_large_they_are():
     assert declared_bytes(hdr) == declared_bytes(hdr.replace(b"2147483647", b"0")) == 0
     for data in (b"", b"#?", b"\x76\x2f\x31\x01", b"\x89PNG", b"\xff\xd8", b"PK\x03\x04"):
         assert declared_bytes(data) in (0, len(data))
-
-
-def test_damage_never_fails_and_stays_small():
-    rng = np.random.default_rng(0)
-    for data in (b"a", b"[a]\n", *whole.toml_files().values(), whole.SCENE.encode()):
-        for _ in range(30):
-            for damaged in (damage.of_bytes, kinds.damaged_configuration, kinds.damaged_scene):
-                assert len(damaged(data, rng)) <= damage.MOST_BYTES

@@ -252,11 +252,15 @@ def spoil_renderer(monkeypatch, steps):
 
 
 @pytest.mark.slow
-def test_bad_steps_are_told_in_metrics_and_history(tmp_path, rng, monkeypatch, capsys):
+def test_what_is_not_finite_is_told_in_metrics_and_history(tmp_path, rng, monkeypatch, capsys):
     spoil_renderer(monkeypatch, {1, 4})
+    compare = pipeline.metrics.compare
+    monkeypatch.setattr(pipeline.metrics, "compare", lambda *a: compare(*a) | {"ssim": math.nan})
     path, out = world(tmp_path, rng, representation={"kind": "pixels"}), tmp_path / "c_out"
     assert call(path, "--quiet", *changed(optimizer__iterations=6, optimizer__kind="adam")) == 0
-    assert measured(out)["non_finite_steps"] == 2 and measured(out)["iterations"] == 6
+    found = measured(out)
+    assert found["non_finite_steps"] == 2 and found["iterations"] == 6 and found["render"]["ssim"] is None
+    assert "metrics.json: render.ssim was not finite and is null" in capsys.readouterr().err
     lines = (out / "history.csv").read_text().splitlines()
     empty = [i for i, line in enumerate(lines[1:]) if line.split(",")[1] == ""]
     assert empty == [1, 4] and (out / "report.html").stat().st_size > 0
@@ -374,16 +378,6 @@ def test_a_map_that_is_kept_is_in_the_units_and_colours_of_its_file(
         assert edited[4:].tobytes() == own[4:].tobytes()
     else:
         assert edited.max() > 1e29
-
-
-@pytest.mark.slow
-def test_a_metric_that_is_not_finite_is_null_and_told(tmp_path, rng, monkeypatch, capsys):
-    compare = pipeline.metrics.compare
-    monkeypatch.setattr(pipeline.metrics, "compare", lambda *a: compare(*a) | {"ssim": math.nan})
-    path = world(tmp_path, rng, representation={"kind": "pixels"})
-    assert call(path, "--quiet") == 0
-    assert measured(tmp_path / "c_out")["render"]["ssim"] is None
-    assert "metrics.json: render.ssim was not finite and is null" in capsys.readouterr().err
 
 
 def test_dists_is_evaluated_now_and_then_and_counts_as_often(rng):

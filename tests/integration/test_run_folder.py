@@ -48,6 +48,12 @@ def test_the_edit_is_carried_to_the_size_of_the_file(kind, tmp_path, rng):
     assert full[WIDTH // 4 :].tobytes() == picture[WIDTH // 4 :].tobytes()  # below the horizon
     assert not np.array_equal(full, picture)
     np.testing.assert_allclose(flux(full), flux(edited), rtol=0.02)
+    channels = OpenEXR.File(str(out / "edited_layers.exr"), separate_channels=True).channels()
+    planes = {name: channel.pixels for name, channel in channels.items()}
+    for i, c in enumerate("RGB"):
+        np.testing.assert_array_equal(planes[c], edited[..., i])
+        np.testing.assert_allclose(planes[f"difference.{c}"], planes[c] - planes[f"initial.{c}"], atol=1e-5)
+    np.testing.assert_array_equal(planes["influence.Y"], images.read(out / "influence.exr")[0][..., 0])
 
 
 def test_a_sky_without_a_file_and_a_file_that_is_no_larger_have_no_full_map(tmp_path, rng):
@@ -80,17 +86,6 @@ def test_what_costs_the_full_map_costs_nothing_else(error, says, tmp_path, rng, 
     out = carried_out(tmp_path, source(rng), **PIXELS)
     assert not (out / "edited_full.exr").exists() and (out / "metrics.json").exists()
     assert says in capsys.readouterr().err
-
-
-def test_layers_are_the_maps_and_their_difference(tmp_path, rng):
-    out = carried_out(tmp_path, source(rng))
-    channels = OpenEXR.File(str(out / "edited_layers.exr"), separate_channels=True).channels()
-    planes = {name: channel.pixels for name, channel in channels.items()}
-    edited, influence = images.read(out / "edited.exr")[0], images.read(out / "influence.exr")[0]
-    for i, c in enumerate("RGB"):
-        np.testing.assert_array_equal(planes[c], edited[..., i])
-        np.testing.assert_allclose(planes[f"difference.{c}"], planes[c] - planes[f"initial.{c}"], atol=1e-5)
-    np.testing.assert_array_equal(planes["influence.Y"], influence[..., 0])
 
 
 def test_strokes_are_carried_out_and_what_cannot_be_had_is_told(tmp_path, rng, capsys):

@@ -87,8 +87,9 @@ CHANGES = ({"seed": 1}, {"spp": 8}, {"max_depth": 2}, {"height": 9, "width": 16}
 def test_another_recording_is_not_taken_for_this_one(lit, tmp_path):
     for change in ({}, *CHANGES):
         assert not build(tmp_path, lit, **change).cached, change
-    dark = scene.load(write_scene(tmp_path, SENSOR, BALL, GROUND, LIGHT, name="dark.xml"))
-    assert not build(tmp_path, dark).cached
+    red = BALL.replace("0.2, 0.4, 0.6", "0.6, 0.4, 0.2")
+    other = scene.load(write_scene(tmp_path, SENSOR, red, GROUND, LAMP, LIGHT, name="other.xml"))
+    assert not build(tmp_path, other).cached
     assert build(tmp_path, lit).cached and build(tmp_path, lit, **CHANGES[-1]).cached
 
 

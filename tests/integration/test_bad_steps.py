@@ -296,14 +296,15 @@ def test_a_rate_that_leads_nowhere_is_blamed_and_leaves_the_first_map(
     assert call(path, "--quiet", *changed(**asked)) == 0
 
 
+def fails(*arguments, **keys):
+    raise NumericalError("not finite at row 1, column 2")
+
+
 @pytest.mark.slow
 def test_what_fails_after_the_loop_leaves_the_map(tmp_path, rng, monkeypatch, capsys):
     path = world(tmp_path, rng, representation={"kind": "pixels"})
     assert call(path, "--quiet", "--out", tmp_path / "whole") == 0
     capsys.readouterr()
-
-    def fails(*arguments, **keys):
-        raise NumericalError("not finite at row 1, column 2")
 
     sampled = scene.Scene.sampled
 
@@ -359,9 +360,6 @@ def test_a_map_that_is_kept_is_in_the_units_and_colours_of_its_file(
     path, out = users_scenes.write(tmp_path, parts), tmp_path / "out"
     own = pixels(tmp_path / "own.exr")
     images.write_exr(tmp_path / "own.exr", own, chromaticities=ACES_AP1)
-
-    def fails(*arguments, **keys):
-        raise NumericalError("not finite at row 1, column 2")
 
     monkeypatch.setattr(pipeline.metrics, "compare", fails)
     keys = {f"{table}__{key}": value for table, keys in TINY.items() for key, value in keys.items()}

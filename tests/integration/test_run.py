@@ -243,21 +243,6 @@ def test_steps_that_achieve_nothing_are_a_warning(factor, tmp_path, rng, capsys)
     assert re.search(rf"nothing in 2 steps: \S+ {unit} now, \S+ {unit} before", line)
 
 
-@pytest.mark.slow
-def test_what_a_display_does_not_show_is_judged_in_stops(tmp_path, rng, capsys):
-    """A map a million times brighter than white: both renderings are white, and 200 dB from the target."""
-    path = world(tmp_path, rng)
-    images.write_exr(tmp_path / "map.exr", 1e6 * (sky(rng) + 0.1))
-    assert call(path, *changed(representation__kind="pixels", optimizer__iterations=0)) == 0
-    found, out = measured(tmp_path / "c_out"), capsys.readouterr().out
-    first, last = (found[key]["log_rmse"] for key in ("initial", "render"))
-    assert found["initial"]["psnr"] > 60 and found["initial"]["beyond_display"] > 0.9 and 0.1 < first == last
-    shown = f"{first:.2f} -> {last:.2f} stops (most of the difference is outside the display's range)"
-    assert f"rendering {shown}, map" in out
-    page = (tmp_path / "c_out" / "report.html").read_text(encoding="utf-8")
-    assert f"{first:.2f} stops" in page and "log RMSE (stops)" in page
-
-
 # ---- what is said and set --------------------------------------------------------------------------------
 
 

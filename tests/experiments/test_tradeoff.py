@@ -13,9 +13,7 @@ from envedit import config
 from envedit.core import latlong
 from envedit.images import images
 from envedit.losses import metrics
-from envedit.sweep import DONE
-from experiments.__main__ import main
-from experiments.harness import Case
+from experiments.harness import Case, Done, rows_of, table
 from experiments.tradeoff import cell, cost, experiment, plan
 from experiments.tradeoff.judge import Judge, without_noise
 
@@ -188,39 +186,25 @@ def one(setting, time, psnr, **more):
     return {"setting": setting, "cost": spent, "judged": judgement(psnr) | more}
 
 
-@pytest.fixture
-def results(tmp_path, monkeypatch):
-    """Results of all six cells: the standard preset's runs and one setting, ``x``."""
-    (tmp_path / "puresky").mkdir()
-    for i, name in enumerate(plan.MAPS):
-        sky = np.full((4, 8, 3), i, np.float32)
-        images.write_exr(tmp_path / f"puresky/{name}_puresky_1k.exr", sky)
-    monkeypatch.setenv("ENVEDIT_DATA", str(tmp_path))
-    cases = experiment.cases(SimpleNamespace(sets=[]))
-    for i, case in enumerate(cases):
-        runs = [one(plan.STANDARD[k], (9.0, 10.0, 14.0)[k], 40.0 + k) for k in range(3)]
-        runs.append(one("x", 5.0 if i % 2 else 20.0, 70.0, sun_degrees=2.0 if i else None))
-        folder = case.job().folder(tmp_path / "out")
-        folder.mkdir(parents=True)
-        bounds = {"unedited": judgement(25.0), "true": judgement(50.0)}
-        (folder / case.result).write_text(json.dumps({"runs": runs, "bounds": bounds}))
-        (folder / DONE).touch()
-    return tmp_path / "out"
+def done(time, sun):
+    """A cell that is done: the standard preset's runs and one setting, ``x``."""
+    runs = [one(plan.STANDARD[k], (9.0, 10.0, 14.0)[k], 40.0 + k) for k in range(3)]
+    runs.append(one("x", time, 70.0, sun_degrees=sun))
+    made = Done(Case("cell", {}, {"cell": "a map, matte"}), None)
+    bounds = {"unedited": judgement(25.0), "true": judgement(50.0)}
+    made.__dict__["metrics"] = {"runs": runs, "bounds": bounds}
+    return made
 
 
-def test_ratios_are_to_the_median_of_the_cell_and_changes_from_the_same_seed(results, capsys):
-    assert main(["tradeoff", "table", "--out", str(results)]) == 0
-    shown = capsys.readouterr().out.splitlines()
-    lines = [[text.strip() for text in line.split("|")[1:-1]] for line in shown]
-    heads = [i for i, line in enumerate(lines) if line[:1] in (["setting"], ["cell"])]
-    means = {line[0]: line[1:] for line in lines[heads[0] : heads[1]] if line}
+def test_ratios_are_to_the_median_of_the_cell_and_changes_from_the_same_seed():
+    rows = rows_of(experiment.EXPERIMENT, [done(20.0, None), done(5.0, 2.0)])
+    x = next(row for row in rows if row["setting"] == "x")
+    times = [x[name] for name in ("s", "again_s", "rendering_s", "tracing_s", "numbers_s", "gb")]
+    assert times == [20, 19.5, 0.5, 0.5, 0.75, 2] and (x["psnr"], x["map_psnr"]) == (55, 20)
+    shown = table(experiment.EXPERIMENT, rows).partition("runs:")[0].splitlines()
+    cells = [[text.strip() for text in line.split("|")[1:-1]] for line in shown]
+    means = {line[0]: line[1:] for line in cells if line}
     # Geometric means: of 0.5 and 2; of 4.5 and 19.5 over 9.5. The rendering is shown with at most 55 dB.
-    assert means["x"] == ["6", "1.00", "0.99", "1.00", "+15.00", "+0.00", "+0.000", "2.0"]
-    assert means["standard, seed 1"][:2] == ["6", "1.00"] and means["standard, seed 1"][4] == "+1.00"
-    assert means["(unedited map)"] == ["6", *["-"] * 7]
-    rows = {tuple(line[:2]): line[2:] for line in lines[heads[1] :] if line}
-    cell_of = f"{plan.MAPS[0]}, matte"
-    x = rows[cell_of, "x"]
-    assert x[:6] == ["20.0", "19.5", "0.5", "0.5", "0.8", "2.00"]
-    assert x[6:] == ["55.0", "20.0", "0.700", "-"]
-    assert rows[cell_of, "(true map)"][:7] == ["-"] * 6 + ["50.0"]
+    assert means["x"] == ["2", "1.00", "0.99", "1.00", "+15.00", "+0.00", "+0.000", "2.0"]
+    assert means["standard, seed 1"][:2] == ["2", "1.00"] and means["standard, seed 1"][4] == "+1.00"
+    assert means["(unedited map)"] == ["2", *["-"] * 7]

@@ -1,9 +1,7 @@
 """Three spheres of light estimation: the pictures, their ground truth, and measures worked out by hand."""
 
 import math
-import os
 from dataclasses import replace
-from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
@@ -13,8 +11,6 @@ from envedit.core import latlong
 from experiments import measures
 from experiments.light_estimation import protocol
 
-TRUTH = Path(os.environ.get("ENVEDIT_DATA", ".")) / "evaluation" / "ground_truth" / "stylelight"
-"""Of DiffusionLight's evaluation, rendered by Blender: the folder ``example`` of its repository."""
 HEIGHT, WIDTH = 256, 512
 """Texels of the map that is read off a mirror; the mirror of 280 pixels shows little more."""
 EDGE = 1.5
@@ -100,13 +96,9 @@ def test_the_median_of_positive_values_becomes_a_half():
     assert not protocol.tonemapped(constant(0)).any()
 
 
-@pytest.fixture
-def mirror():
-    return protocol.SPHERES["mirror"]
-
-
 @pytest.mark.slow
-def test_a_constant_map_gives_the_reflectance(mirror):
+def test_a_constant_map_gives_the_reflectance():
+    mirror = protocol.SPHERES["mirror"]
     for sphere in (mirror, protocol.SPHERES["matte silver"]):
         found = protocol.render(replace(sphere, samples=8), constant(0.5))
         height, width = len(found) // 2, found.shape[1] // 2
@@ -120,7 +112,7 @@ def test_a_constant_map_gives_the_reflectance(mirror):
 @pytest.mark.parametrize("direction, side", [
     ((0, -1, 0), (0, 0)), ((1, 0, 0), (1, 0)), ((-1, 0, 0), (-1, 0)), ((0, 0, 1), (0, 1)),
 ], ids=["towards the camera", "right", "left", "above"])  # fmt: skip
-def test_directions_of_blender_are_where_its_camera_sees_them(direction, side, mirror):
+def test_directions_of_blender_are_where_its_camera_sees_them(direction, side):
     """Blender: +z is up, u = 1/2 - atan2(y, x) / 2 pi, v = 1/2 - asin(z) / pi; the camera looks along +y."""
     x, y, z = direction
     column = (0.5 - math.atan2(y, x) / (2 * math.pi)) % 1 * 64
@@ -128,7 +120,7 @@ def test_directions_of_blender_are_where_its_camera_sees_them(direction, side, m
     lit[round((0.5 - math.asin(z) / math.pi) * 32), [int(column) - 1, int(column)]] = 1
     if z:
         lit[0] = 1
-    found = protocol.render(mirror, lit)[..., 0]
+    found = protocol.render(protocol.SPHERES["mirror"], lit)[..., 0]
     down, right = (np.argwhere(found > found.max() / 2) - [269.5, 479.5]).mean(axis=0) / 140
     # A mirror that faces halfway between the camera and a direction at 90 degrees is at sin(45 degrees).
     assert (right, -down) == pytest.approx(np.multiply(side, math.sqrt(0.5)), abs=0.13)
@@ -179,17 +171,20 @@ def _unit(v):
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not TRUTH.is_dir(), reason="ENVEDIT_DATA has no evaluation/ground_truth/stylelight")
 @pytest.mark.parametrize("name, most", [("diffuse", 0.15), ("matte silver", 0.13), ("mirror", 0.25)])
-def test_spheres_are_those_of_the_ground_truth(name, most):
+def test_spheres_are_those_of_the_ground_truth(name, most, data):
     """RMSE .042, .060 and .231 of the page, at a sixteenth of its samples.
 
-    The map of the ground truth is not published with it. It is read off the mirror, which reflects nearly
-    every direction. The mirror is compared with what was read off it: that checks camera and sphere.
+    Blender's pictures are of DiffusionLight's evaluation (the folder ``example`` of its repository). Their
+    map is not published: it is read off the mirror, which reflects nearly every direction. The mirror is
+    compared with what was read off it: that checks camera and sphere.
     """
+    folder = data / "evaluation" / "ground_truth" / "stylelight"
+    if not folder.is_dir():
+        pytest.skip("ENVEDIT_DATA has no evaluation/ground_truth/stylelight")
 
     def truth(sphere):
-        return np.asarray(mi.Bitmap(str(TRUTH / sphere.replace(" ", "_") / "abandoned_bakery_4k.exr")))
+        return np.asarray(mi.Bitmap(str(folder / sphere.replace(" ", "_") / "abandoned_bakery_4k.exr")))
 
     sphere = protocol.SPHERES[name]
     few = replace(sphere, samples=max(1, sphere.samples // 16))

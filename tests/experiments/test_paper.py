@@ -53,10 +53,6 @@ def settings_by_row(made):
     return {(case.about["settings"], case.about["row"]): settings_of(job) for case, job in made}
 
 
-def keys(made):
-    return [job.key for _, job in made]
-
-
 def text(out, made):
     return harness.table(EXPERIMENT, harness.rows_of(EXPERIMENT, harness.done_of(made, out)))
 
@@ -78,18 +74,6 @@ def test_the_paper_s_numbers_are_complete_and_agree_with_each_other():
 
 
 # ---- jobs --------------------------------------------------------------------------------------------------
-@pytest.mark.slow
-@pytest.mark.parametrize(("name", "paper", "ours"), [
-    ("table1", 9, 11), ("table2", 9, 11), ("table3", 9 * 4 * 3, 11 * 4 * 3),
-])  # fmt: skip
-def test_a_table_is_rows_by_maps_by_roughness(maps, build, name, paper, ours):
-    made = build(name)
-    abouts = [case.about for case, _ in made]
-    assert [sum(a["settings"] == s for a in abouts) for s in ("paper", "ours")] == [paper, ours]
-    assert len(set(keys(made))) == len({case.name for case, _ in made}) == len(made)
-    assert len({(a["settings"], a["row"], a["map"], a["roughness"]) for a in abouts}) == len(made)
-
-
 def test_the_paper_s_settings_are_its_own_and_ours_the_standard_preset(maps, build):
     made = settings_by_row(build("table1"))
     assert [row for s, row in made if s == "paper"] == PAPER_ROWS
@@ -121,22 +105,10 @@ def test_a_table_of_one_map_has_all_of_them_where_asked(maps, build):
     assert {case.about["map"] for case, _ in build("table3")} == everything
 
 
-def test_tables_share_the_runs_they_have_in_common(maps, build):
-    siren = "paper-siren-autumn", "ours-siren-autumn"
-    mirror = build("table1", *siren, sets=["scene.file=mirror"])
-    assert len(mirror) == 2 and keys(mirror) == keys(build("table2", *siren))
-    # A fit does not depend on the regulariser of its edit, and is found on disk by it: jobs of a map that
-    # share one do not stand side by side.
-    rows = [case.about["row"] for case, _ in build("table3", "paper-")][:8]
-    assert rows == ["pixels"] * 4 + ["pixels-reg"] * 4
-
-
 def test_roughness_and_overrides_reach_the_runs(maps, build):
     sets = ["scene.file=sphere", "target.rotate_degrees=140", "fit.epochs=7", "scene.parameters.turn=3"]
-    made = build("table3", "ours-r-siren-dusk", sets=sets)
-    found = [settings_of(job) for _, job in made]
+    found = [settings_of(job) for _, job in build("table3", "ours-r-siren-dusk", sets=sets)]
     assert [one.scene.parameters for one in found] == [{"roughness": r, "turn": 3} for r in (0, 0.5, 1)]
-    assert [case.about["roughness"] for case, _ in made] == [0, 0.5, 1]
     asked = {(one.scene.file, one.target.rotate_degrees, one.fit.epochs) for one in found}
     assert asked == {("sphere", 140, 7)}
     assert settings_of(build("table2", "ours-siren-autumn")[0][1]).scene.file == "mirror"
@@ -206,19 +178,14 @@ def row_of(text, title):
 
 def test_a_table_has_a_row_for_each_method_that_is_done(maps, build, tmp_path):
     made = build("table1", "paper-")
-    assert finish(tmp_path, made, "-r-siren-autumn", numbers={**SOME, "psnr": 14.125, "lpips": 0.4}) == 1
-    finish(tmp_path, made, "paper-pixels-autumn", numbers={**SOME, "psnr": 13.0, "mse": 0.002})
+    finish(tmp_path, made, "-r-siren-autumn", numbers={**SOME, "psnr": 14.125, "lpips": 0.4})
+    finish(tmp_path, made, "paper-pixels-autumn")
     shown = text(tmp_path, made)
     assert shown.splitlines()[0] == f"The paper's settings, {OTHER}:"
-    (siren,) = row_of(shown, "R-SIREN HDR")
-    assert siren[:8] == ["14.12", "0.400", "0.01000", "0.500", "34.12", "0.400", "0.01000", "0.500"]
-    assert siren[8:] == ["-", "30", "1"]
-    (pixels,) = row_of(shown, "Pixels")
-    assert pixels[:3] == ["13.00", "-", "0.00200"]
-    (unedited,) = row_of(shown, "unedited")
-    assert unedited[:-1] == ["9.00", "-", "0.01000", "0.500", "12.00", "-", "0.01000", "0.500", "-", "-"]
-    (true,) = row_of(shown, "the true map")
-    assert true == ["-"] * 4 + ["48.00", "-", "0.01000", "0.500", "-", "-", "2"]
+    siren = ["14.12", "0.400", "0.01000", "0.500", "34.12", "0.400", "0.01000", "0.500", "-", "30", "1"]
+    assert row_of(shown, "R-SIREN HDR") == [siren]
+    (unedited,), (true,) = (row_of(shown, title) for title in ("unedited", "the true map"))
+    assert (unedited[0], unedited[4]) == ("9.00", "12.00") and true[:5] == [*"----", "48.00"]
     theirs = "14.56", "0.621", "0.03496", "0.345", "46.38", "0.053", "0.00002", "0.993"
     assert row_of(shown, "SIREN HDR, published") == [[*theirs, "-", "-", "1"]]
     assert not row_of(shown, "SIREN HDR")

@@ -82,11 +82,6 @@ def test_an_export_is_a_picture_that_is_not_there(path, capsys, tmp_path):
 # ---- files: 3 --------------------------------------------------------------------------------------------
 
 
-def test_a_map_that_is_not_there(path, capsys):
-    said = fails(3, capsys, path, *changed(input__envmap="none.exr"))
-    assert str(path.parent / "none.exr") in said  # relative to the configuration
-
-
 @pytest.mark.slow
 def test_a_png_as_map_is_taken_with_a_warning(path, capsys, tmp_path, rng):
     images.write_png(tmp_path / "map.png", sky(rng) / 3)
@@ -141,9 +136,10 @@ def test_an_output_folder_that_cannot_be_made_or_written_to(path, capsys, tmp_pa
     assert (tmp_path / "c_out").read_text() == "mine"
 
 
-def test_a_run_that_fails_leaves_no_empty_folder(path, capsys, tmp_path):
+def test_a_map_that_is_not_there_is_told_and_no_empty_folder_is_left(path, capsys, tmp_path):
     out = tmp_path / "new" / "folder"
-    fails(3, capsys, path, *changed(input__envmap="none.exr"), "--out", str(out))
+    said = fails(3, capsys, path, *changed(input__envmap="none.exr"), "--out", str(out))
+    assert str(path.parent / "none.exr") in said  # relative to the configuration
     assert not out.parent.exists()
     out.mkdir(parents=True)
     fails(3, capsys, path, *changed(input__envmap="none.exr"), "--out", str(out))

@@ -4,14 +4,9 @@ Every sum has a fixed order. Mitsuba's path tracer adds the gradients of a texel
 come to them: they are traced by one.
 """
 
-import os
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 
-from tests.oracles import ROOT
 from tests.oracles.runs import call, changed, differing, pixels, world
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("isolated", "own_core")]
@@ -31,11 +26,6 @@ def carried_out(tmp_path, monkeypatch, threads):
         return out
 
     return run
-
-
-def error(one, other):
-    a, b = (pixels(folder / "edited.exr").astype(np.float64) for folder in (one, other))
-    return float((np.abs(a - b) / np.maximum(a, 1e-3)).max())
 
 
 def configured(folder, rng, kind, renderer="transport"):
@@ -64,23 +54,6 @@ def test_a_wide_pixel_filter_and_odd_numbers_of_samples_give_the_same_files(tmp_
     odd = changed(target__spp=100, output__spp=144)
     one, two = (carried_out(path, count, *odd) for count in (1, 2))
     assert differing(one, two) == set()
-
-
-def test_another_seed_gives_other_bytes(tmp_path, rng, carried_out):
-    """So that the same bytes mean something: what is compared depends on the samples."""
-    path = configured(tmp_path, rng, "log-pixels")
-    one, other = carried_out(path, 1), carried_out(path, 1, *changed(seed=1))
-    assert "edited.exr" in differing(one, other)
-    assert error(one, other) > 1e-4
-
-
-def test_another_process_gives_the_same_files(tmp_path, rng):
-    """With another order of sets and dicts of strings, and with as many threads as there are cores."""
-    path = configured(tmp_path, rng, "layers")
-    first, second = (tmp_path / f"process-{number}" for number in (1, 2))
-    for out, number in ((first, "1"), (second, "2")):
-        command = [sys.executable, "-m", "envedit.run", str(path), "--quiet", "--out", str(out)]
-        # The second one finds what the first one kept.
-        environment = os.environ | {"PYTHONHASHSEED": number, "XDG_CACHE_HOME": str(tmp_path / "shared")}
-        subprocess.run(command, cwd=ROOT, env=environment, check=True, timeout=120)
-    assert differing(first, second) == set()
+    # What is compared depends on the samples, so that the same bytes mean something.
+    a, b = (pixels(out / "edited.exr") for out in (one, carried_out(path, 2, *odd, *changed(seed=1))))
+    assert (np.abs(a - b) / np.maximum(a, 1e-3)).max() > 1e-4

@@ -58,11 +58,6 @@ def test_a_package_adds_three_kinds(installed):
     np.testing.assert_allclose(result.envmap, envmap * ratio, rtol=1e-3)
 
 
-def test_a_kind_that_nobody_adds_is_named():
-    with pytest.raises(ConfigError, match="representation.kind: got 'one_colour', expected one of layers"):
-        config.from_dict({"representation": {"kind": "one_colour"}})
-
-
 def test_a_module_that_cannot_be_imported_is_named(installed, tmp_path):
     (tmp_path / "one_colour.py").write_text("import a_module_that_is_missing\n")
     settings = config.from_dict({"representation": {"kind": "one_colour"}})

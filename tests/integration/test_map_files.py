@@ -148,6 +148,3 @@ def test_a_run_writes_the_format_that_is_asked_for(tmp_path):
     np.testing.assert_allclose(
         pixels(tmp_path / "c_out" / "edited.hdr"), pixels(tmp_path / "own.exr"), rtol=0.01, atol=0.02
     )
-
-
-# ---- where other programs look a direction up --------------------------------------------------------------

@@ -5,14 +5,12 @@ import json
 import os
 import signal
 import socket
-import struct
 import subprocess
 import sys
 import threading
 import urllib.error
 import urllib.request
 
-import numpy as np
 import pytest
 
 from envedit.cli.paint import protocol
@@ -36,14 +34,6 @@ def server(tmp_path_factory):
         until(lambda: "opened" in found.hub.last)
         yield found
     os.chdir(before)
-
-
-def shown(socket):
-    while True:
-        received = socket.recv(timeout=60)
-        if isinstance(received, bytes) and received[4:6] == b"\0\0":
-            width, height = struct.unpack("<HH", received[6:10])
-            return np.frombuffer(received[16:], "<f2").reshape(height, width, 3).astype(np.float32)
 
 
 def test_without_the_token_or_from_elsewhere_nobody_is_let_in(server):
@@ -171,20 +161,6 @@ def test_a_highlight_tells_its_light_and_the_light_follows_a_pixel(server):
         send(page, "pick", x=0.5, y=0.9, light=0, number=4)
         floor = heard(page, "picked")
         assert "not glossy" in floor["text"] and "azimuth" not in floor, floor
-
-
-def test_a_light_that_was_placed_is_told_with_the_number_of_its_edit(server):
-    with connected(server) as page:
-        bare = shown(page)
-        light = {"light": 1, "azimuth": 270.0, "elevation": 40.0}
-        for number, phase in ((9, "dragging"), (10, "done")):
-            painted(page, number, {"lights": [light]}, phase=phase)
-        send(page, "document", number=11, document={"lights": [light]})
-        moved = shown(page)
-        painted(page, 12, {})
-    left, right = (slice(36, 39), slice(8, 11)), (slice(36, 39), slice(40, 43))
-    assert moved[left].mean() > 1.5 * bare[left].mean(), "its shadow is still where it was"
-    assert moved[right].mean() < bare[right].mean()
 
 
 def test_a_busy_port_is_told_and_ctrl_c_ends_it(tmp_path):

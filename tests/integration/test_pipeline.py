@@ -299,6 +299,18 @@ def test_rows_that_fill_no_cell_of_the_block_transport_can_be_edited(tmp_path, r
     assert found.envmap[others].tobytes() == picture[others].tobytes()
 
 
+class Stub:
+    """A measure that is the mean squared difference of display values."""
+
+    backbone = types.SimpleNamespace(least_size=5)
+
+    def against(self, reference):
+        return lambda x: dr.mean(dr.square(x.array - reference.array))
+
+    def __call__(self, a, b):
+        return float(np.mean(np.abs(a - b)))
+
+
 @pytest.mark.slow
 def test_a_siren_says_how_to_get_weights_and_has_dists_where_they_are(tmp_path, rng, monkeypatch):
     few = {"representation": {"kind": "siren", "hidden": 16, "depth": 1}, "fit": {"epochs": 20}}
@@ -310,12 +322,18 @@ def test_a_siren_says_how_to_get_weights_and_has_dists_where_they_are(tmp_path, 
     assert found.settings.loss.dists == 0 and "dists" not in found.history[0]
     asked = pipeline.run(settings_of(tmp_path, sunny(rng), **few, loss={"dists": 0.6}))
     assert any("DISTS" in line and "loss.dists" in line for line in asked.warnings)
-    with_networks(monkeypatch, Stub(), None)
+    monkeypatch.setattr(
+        installed,
+        "load",
+        lambda settings: installed.Networks(installed.settled(settings), Stub(), Stub(), ""),
+    )
     (tmp_path / "weights").mkdir()
-    there = {"perceptual": {"weights": str(tmp_path / "weights")}}
+    there = {"perceptual": {"weights": str(tmp_path / "weights"), "dists_every": 1}}
     found = pipeline.run(settings_of(tmp_path, sunny(rng), **few, **there))
     assert found.settings.loss.dists == 0.1 and found.history[-1]["dists"] > 0
     assert found.settings.optimizer.iterations == 2 and not any("DISTS" in line for line in found.notes)
+    assert found.metrics["render"]["lpips"] > 0 and found.metrics["initial"]["lpips"] > 0
+    assert found.metrics["envmap"]["lpips"] is None  # 4 rows are too few for the network
 
 
 @pytest.mark.slow
@@ -332,41 +350,6 @@ def test_a_siren_reaches_a_sky_brighter_than_any_texel_of_the_map(tmp_path, rng)
     assert any("the sky begins" in line for line in found.notes)
     assert found.envmap[active].mean() / picture[active].mean() == pytest.approx(4, rel=0.1)
     assert found.metrics["render"]["psnr"] > found.metrics["initial"]["psnr"] + 10
-
-
-class Stub:
-    """A measure that is the mean squared difference of display values."""
-
-    backbone = types.SimpleNamespace(least_size=5)
-
-    def against(self, reference):
-        return lambda x: dr.mean(dr.square(x.array - reference.array))
-
-    def __call__(self, a, b):
-        return float(np.mean(np.abs(a - b)))
-
-
-def with_networks(monkeypatch, dists, lpips):
-    monkeypatch.setattr(
-        installed,
-        "load",
-        lambda settings: installed.Networks(installed.settled(settings), dists, lpips, ""),
-    )
-
-
-@pytest.mark.slow
-def test_perceptual_terms_are_used_where_their_weights_are_named(tmp_path, rng, monkeypatch):
-    with_networks(monkeypatch, Stub(), Stub())
-    short = {
-        "optimizer": {"iterations": 3},
-        "loss": {"dists": 5.0, "change": 0.0},
-        "perceptual": {"dists_every": 1},
-    }
-    found = pipeline.run(settings_of(tmp_path, sunny(rng), **PIXELS, **short))
-    assert all(row["dists"] >= 0 for row in found.history) and found.history[-1]["dists"] > 0
-    assert not any("dists" in line for line in found.warnings)
-    assert found.metrics["render"]["lpips"] > 0 and found.metrics["initial"]["lpips"] > 0
-    assert found.metrics["envmap"]["lpips"] is None  # 4 rows are too few for the network
 
 
 @pytest.mark.parametrize(
@@ -571,31 +554,19 @@ def test_a_run_is_resumed_although_mitsuba_renders_the_target_anew(tmp_path, rng
     assert calls and resumed.envmap.tobytes() == whole.envmap.tobytes()
 
 
-@pytest.mark.slow
-def test_ctrl_c_is_given_back_after_the_edit(tmp_path, rng):
+def test_ctrl_c_is_given_back_and_a_second_one_is_not_waited_for():
     before = signal.getsignal(signal.SIGINT)
-    settings = settings_of(tmp_path, sunny(rng), optimizer={"iterations": 1}, **PIXELS)
-    pipeline.run(settings)
-    assert signal.getsignal(signal.SIGINT) is before
-    with pytest.raises(pipeline.Interrupted):
-        (tmp_path / "run").mkdir()
-        pipeline.run(settings, folder=tmp_path / "run", watch=interrupting())
-    assert signal.getsignal(signal.SIGINT) is before
-
-
-def test_a_second_ctrl_c_is_not_waited_for():
     with pytest.raises(KeyboardInterrupt), interrupts.ctrl_c() as event:
         signal.raise_signal(signal.SIGINT)
         assert event.is_set()
         signal.raise_signal(signal.SIGINT)
+    assert signal.getsignal(signal.SIGINT) is before
 
-
-def test_outside_the_main_thread_signals_are_left_alone():
     def enter():
         with interrupts.ctrl_c() as event:
             return event.is_set()
 
-    with ThreadPoolExecutor(1) as thread:
+    with ThreadPoolExecutor(1) as thread:  # where signals cannot be handled
         assert not thread.submit(enter).result()
 
 

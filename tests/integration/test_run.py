@@ -23,7 +23,6 @@ from envedit.cli.progress import Progress
 from envedit.core.color import tonemap
 from envedit.images import images
 from envedit.losses.perceptual import installed
-from envedit.renderers import StoredRenderer
 from envedit.solve import adam_loop
 from envedit.transport.light_transport import LightTransport
 from tests.oracles import ROOT
@@ -54,7 +53,9 @@ PIXELS = {"representation": {"kind": "pixels"}}
 def done(tmp_path_factory):
     """Return (configuration, output folder, stdout, stderr) of one finished run."""
     folder = tmp_path_factory.mktemp("done")
-    path = world(folder, np.random.default_rng(0), representation={"kind": "siren", "hidden": 16, "depth": 1})
+    network = {"kind": "siren", "hidden": 16, "depth": 1}
+    turned = {"rotate_degrees": 90.0}
+    path = world(folder, np.random.default_rng(0), representation=network, target=turned)
     out, err = io.StringIO(), io.StringIO()
     with small_world(folder / "cache"), contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         assert call(path) == 0
@@ -94,8 +95,12 @@ def test_pictures_and_metrics_are_finite(done):
 
 
 def test_metrics_are_those_of_the_written_pictures(done):
-    """Against the definition, from the files: mean squared error of clip(E, 0, 1)^(1/2.2)."""
-    _, folder, _, _ = done
+    """Against the definition, from the files: mean squared error of clip(E, 0, 1)^(1/2.2).
+
+    Of the map on its active rows, against the true one: 90 degrees are a quarter of the columns, so that
+    turning is exact whatever its sense.
+    """
+    path, folder, _, _ = done
     found = measured(folder)
 
     def error(a, b):
@@ -107,30 +112,9 @@ def test_metrics_are_those_of_the_written_pictures(done):
         mse = error(pixels(folder / name), target)
         assert found[key]["mse"] == pytest.approx(mse, rel=1e-4)
         assert found[key]["psnr"] == pytest.approx(-10 * math.log10(mse), abs=1e-3)
-
-
-@pytest.mark.slow
-def test_the_map_is_measured_on_its_active_rows_against_the_one_that_was_turned(tmp_path, rng):
-    """90 degrees are a quarter of the columns, so that turning is exact whatever its sense."""
-    path = world(tmp_path, rng, **PIXELS, target={"rotate_degrees": 90.0})
-    assert call(path, "--quiet") == 0
-    found, start = measured(tmp_path / "c_out"), pixels(tmp_path / "map.exr")
-    edited = pixels(tmp_path / "c_out" / "edited.exr")
-    errors = []
-    for true in (np.roll(start, 4, axis=1), np.roll(start, -4, axis=1)):
-        shown = [np.clip(np.float64(x[:4]), 0, 1) ** (1 / 2.2) for x in (edited, true)]
-        errors.append(np.mean((shown[0] - shown[1]) ** 2))
-    assert any(found["envmap"]["mse"] == pytest.approx(error, rel=1e-3) for error in errors)
-
-
-def test_history_has_a_row_for_every_iteration(done):
-    rows = rows_of(done[1])
-    assert [int(row["iteration"]) for row in rows] == [0, 1, 2, 3]
-    for row in rows:
-        assert all(math.isfinite(float(value)) for value in row.values())
-        terms = row.keys() - {"iteration", "loss", "lr", "step_ms"}
-        assert "ssim" in terms
-        assert float(row["loss"]) == pytest.approx(sum(float(row[term]) for term in terms), rel=1e-5)
+    start, edited = pixels(path.parent / "map.exr")[:4], pixels(folder / "edited.exr")[:4]
+    errors = [error(edited, np.roll(start, columns, axis=1)) for columns in (4, -4)]
+    assert any(found["envmap"]["mse"] == pytest.approx(mse, rel=1e-3) for mse in errors)
 
 
 def test_the_resolved_configuration_loads_back_to_the_same_one(done):
@@ -158,13 +142,6 @@ def test_preview_and_report_are_whole(done):
     assert page.count("<figure>") == page.count("</figure>") and "<svg" in page
     assert f"{measured(folder)['render']['psnr']:.4g}"[:4] in page
     assert not re.search(r'(src|href)\s*=\s*"https?:', page)  # opens offline
-
-
-@pytest.mark.slow
-def test_without_a_report_neither_page_nor_preview_is_written(tmp_path, rng):
-    path = world(tmp_path, rng, **PIXELS, output={"report": False})
-    assert call(path, "--quiet") == 0
-    assert names(tmp_path / "c_out") == FILES - {"preview.png", "report.html"} | INFLUENCE
 
 
 # ---- what is computed ------------------------------------------------------------------------------------
@@ -266,21 +243,6 @@ def test_steps_that_achieve_nothing_are_a_warning(factor, tmp_path, rng, capsys)
     assert re.search(rf"nothing in 2 steps: \S+ {unit} now, \S+ {unit} before", line)
 
 
-@pytest.mark.slow
-def test_what_a_display_does_not_show_is_judged_in_stops(tmp_path, rng, capsys):
-    """A map a million times brighter than white: both renderings are white, and 200 dB from the target."""
-    path = world(tmp_path, rng)
-    images.write_exr(tmp_path / "map.exr", 1e6 * (sky(rng) + 0.1))
-    assert call(path, *changed(representation__kind="pixels", optimizer__iterations=0)) == 0
-    found, out = measured(tmp_path / "c_out"), capsys.readouterr().out
-    first, last = (found[key]["log_rmse"] for key in ("initial", "render"))
-    assert found["initial"]["psnr"] > 60 and found["initial"]["beyond_display"] > 0.9 and 0.1 < first == last
-    shown = f"{first:.2f} -> {last:.2f} stops (most of the difference is outside the display's range)"
-    assert f"rendering {shown}, map" in out
-    page = (tmp_path / "c_out" / "report.html").read_text(encoding="utf-8")
-    assert f"{first:.2f} stops" in page and "log RMSE (stops)" in page
-
-
 # ---- what is said and set --------------------------------------------------------------------------------
 
 
@@ -293,19 +255,12 @@ def test_quiet_prints_nothing(tmp_path, rng, capsys):
 
 
 @pytest.mark.slow
-def test_presets_and_overrides_take_effect(tmp_path, rng):
-    path, overrides = world(tmp_path, rng, **PIXELS), ["optimizer.iterations=1", "seed=5"]
-    changes = [part for one in overrides for part in ("--set", one)]
-    assert call(path, "--quiet", "--preset", "draft", *changes) == 0
-    expected = config.load(path, "draft", [*overrides, f"output.dir={tmp_path / 'c_out'}"])
-    assert config.load(tmp_path / "c_out" / "config.toml") == expected != config.load(path)
-
-
-@pytest.mark.slow
-def test_out_may_have_any_name(tmp_path, rng):
-    path, name = world(tmp_path / "in", rng, **PIXELS), 'é ü 😀 a"b back\\slash'
-    assert call(path, "--quiet", "--out", tmp_path / name, *changed(optimizer__iterations=0)) == 0
-    assert names(tmp_path) == {"in", name} and names(tmp_path / name) >= FILES
+def test_preset_overrides_and_an_odd_name_of_the_folder_take_effect(tmp_path, rng):
+    path, out = world(tmp_path / "in", rng, **PIXELS), tmp_path / 'é ü 😀 a"b back\\slash'
+    assert call(path, "--quiet", "--preset", "draft", "--set", "seed=5", "--out", out) == 0
+    assert names(tmp_path) == {"in", out.name} and names(out) >= FILES
+    expected = config.load(path, "draft", ["seed=5", f"output.dir={config.quote(str(out))}"])
+    assert config.load(out / "config.toml") == expected != config.load(path)
 
 
 @pytest.mark.slow
@@ -324,14 +279,12 @@ def test_the_written_configuration_runs_again_in_its_own_folder(tmp_path, rng, m
     assert "metrics.json" not in names(out) and call(out / "config.toml", "--quiet") == 0
 
 
-@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="links")
-def test_an_input_is_not_moved_away_with_earlier_results_by_any_name(tmp_path, rng, capsys):
-    path, out = world(tmp_path, rng, **PIXELS), tmp_path / "c_out"
-    assert call(path, "--quiet") == 0
+def test_an_input_is_not_moved_away_with_earlier_results_by_any_name(done, tmp_path, capsys):
+    path, out, _, _ = done
     before = content(out)
     (tmp_path / "link").symlink_to(out)
-    for folder in (out, tmp_path / "link", tmp_path / "nowhere" / ".." / "c_out"):
+    for folder in (out, tmp_path / "link", out.parent / "nowhere" / ".." / out.name):
         capsys.readouterr()
         assert call(path, "--quiet", *changed(input__envmap=str(folder / "edited.exr"))) == 3
         said = capsys.readouterr().err
@@ -354,17 +307,21 @@ def test_a_finished_run_has_nothing_to_resume(done, capsys):
 
 @pytest.mark.slow
 def test_a_finished_run_whose_input_has_changed_is_not_complete(tmp_path, rng, capsys):
-    path, out = world(tmp_path, rng, **PIXELS), tmp_path / "c_out"
-    assert call(path, "--quiet", *changed(optimizer__iterations=1)) == 0
+    """And a run without a report leaves neither page nor preview."""
+    optimizer = {"iterations": 1}
+    path = world(tmp_path, rng, **PIXELS, output={"report": False}, optimizer=optimizer)
+    out = tmp_path / "c_out"
+    assert call(path, "--quiet") == 0
+    assert names(out) == FILES - {"preview.png", "report.html"} | INFLUENCE
     before = content(out)
     named = Path(config.load(path).input.envmap)
     images.write_exr(named, 2 * images.read(named)[0])
     capsys.readouterr()
-    assert call(path, "--resume", *changed(optimizer__iterations=1)) == 3
+    assert call(path, "--resume") == 3
     said = capsys.readouterr().err
     assert said.startswith(f"envedit: {named}: has changed since") and len(said.splitlines()) == 1
     named.unlink()
-    assert call(path, "--resume", *changed(optimizer__iterations=1)) == 0
+    assert call(path, "--resume") == 0
     assert content(out) == before
 
 
@@ -387,21 +344,16 @@ def test_ctrl_c_inside_an_operation_is_ctrl_c(tmp_path, rng, capsys, monkeypatch
     assert "interrupted" in capsys.readouterr().err
 
 
-def interrupting(during):
-    """Return what is called with the names of stages, and ends one as Ctrl-C does."""
-
-    def stage(self, text):
-        if text == during:
-            raise KeyboardInterrupt
-
-    return stage
-
-
 @pytest.mark.slow
 def test_a_changed_configuration_is_not_resumed(tmp_path, rng, capsys, monkeypatch):
     path, out = world(tmp_path, rng, **PIXELS), tmp_path / "c_out"
+
+    def interrupting(self, text):
+        if text == "writing":
+            raise KeyboardInterrupt
+
     with monkeypatch.context() as patch:
-        patch.setattr(Progress, "stage", interrupting("writing"))
+        patch.setattr(Progress, "stage", interrupting)
         assert call(path, "--quiet") == 130
     said = capsys.readouterr().err
     assert "--resume" in said and len(said.splitlines()) == 1
@@ -413,19 +365,6 @@ def test_a_changed_configuration_is_not_resumed(tmp_path, rng, capsys, monkeypat
     # Without --resume the checkpoint is an earlier run's and is kept like its results.
     assert call(path, "--quiet") == 0
     assert names(out / "earlier-1") == {"checkpoint.npz"} and "checkpoint.npz" not in names(out)
-
-
-@pytest.mark.slow
-def test_an_interrupt_after_the_last_iteration_costs_none(tmp_path, rng, capsys, monkeypatch):
-    path, out = world(tmp_path, rng, **PIXELS), tmp_path / "c_out"
-    assert call(path, "--quiet", "--out", tmp_path / "whole") == 0
-    with monkeypatch.context() as patch:
-        patch.setattr(Progress, "stage", interrupting("rendering the result"))
-        assert call(path, "--quiet") == 130
-    assert "--resume" in capsys.readouterr().err and "checkpoint.npz" in names(out)
-    monkeypatch.setattr(StoredRenderer, "render", lambda self, envmap, step: 1 / 0)
-    assert call(path, "--quiet", "--resume") == 0
-    assert pixels(out / "edited.exr").tobytes() == pixels(tmp_path / "whole" / "edited.exr").tobytes()
 
 
 def started(path, cache, *arguments):
@@ -510,13 +449,15 @@ def test_ctrl_c_while_mitsuba_is_imported(tmp_path, rng):
 
 @pytest.mark.slow
 def test_help_needs_no_renderer(tmp_path):
-    """The text comes at once: neither the import nor --help loads Mitsuba, Dr.Jit or NumPy."""
+    """The text comes at once: neither imports nor --help load Mitsuba, Dr.Jit or NumPy."""
     program = (
-        "import sys, envedit.run\n"
+        "import sys, envedit, envedit.run\n"
+        "dir(envedit)\n"
         "try: envedit.run.main(['--help'])\n"
         "except SystemExit as stop: assert stop.code == 0\n"
         "loaded = {'mitsuba', 'drjit', 'numpy', 'OpenEXR'} & set(sys.modules)\n"
-        "assert not loaded, loaded"
+        "assert not loaded, loaded\n"
+        "envedit.Config()"
     )
     found = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True)
     assert found.returncode == 0, found.stderr
@@ -530,9 +471,11 @@ def test_help_needs_no_renderer(tmp_path):
 def test_the_initial_rendering_is_exported_and_nothing_else(tmp_path, rng, capsys):
     path = world(tmp_path, rng, target={"kind": "image", "file": "later.png"})
     before = content(tmp_path)
-    for name in ("a.exr", "b.png", "c.exr"):
+    for name in ("a.exr", "c.exr"):
         assert call(path, "--quiet", "--export-initial", tmp_path / name) == 0
     assert capsys.readouterr().out == ""
+    assert call(path, "--export-initial", tmp_path / "b.png") == 0
+    assert f'file = "{tmp_path / "b.png"}"' in capsys.readouterr().out
     after = content(tmp_path)
     made = {"a.exr", "b.png", "c.exr"}
     assert after.keys() - before.keys() == made | {f"{name}.envedit.json" for name in made}
@@ -542,11 +485,6 @@ def test_the_initial_rendering_is_exported_and_nothing_else(tmp_path, rng, capsy
     expected = np.rint(tonemap(pixels(tmp_path / "a.exr").astype(np.float64), "reinhard") * 65535)
     assert expected.max() < 65535 and pixels(tmp_path / "a.exr").max() > 1
     assert np.abs(read_png(tmp_path / "b.png") - expected).max() <= 1
-
-
-def test_the_export_says_how_the_file_is_named_in_a_configuration(tmp_path, rng, capsys):
-    assert call(world(tmp_path, rng), "--export-initial", tmp_path / "b.png") == 0
-    assert f'file = "{tmp_path / "b.png"}"' in capsys.readouterr().out
 
 
 def test_strokes_that_paint_nothing_are_a_mistake_of_the_configuration(tmp_path, rng, capsys):

@@ -1,4 +1,4 @@
-"""Which lights explain paint: shadows painted elsewhere, lights painted in, and neither."""
+"""Which lights explain paint, or a rendered target: they move, are added, become larger, or stay."""
 
 import mitsuba as mi
 import numpy as np
@@ -10,7 +10,7 @@ from envedit.representations.layers.layers import Layers
 from envedit.scene import scene
 from envedit.solve import gauss_newton, search
 from envedit.solve.gauss_newton import Run
-from envedit.solve.likelihood import VISIBLE, Likelihood
+from envedit.solve.likelihood import VISIBLE, Likelihood, on_average_one
 from envedit.solve.map_problem import Problem
 from envedit.solve.prior import of_paint
 from envedit.targets.pixel_weights import FOLLOWING, pixel_weight
@@ -285,3 +285,90 @@ def test_a_map_that_is_not_finite_has_no_explanation(transport):
     start["flux"][0] = np.nan
     found = search.search(problem, start)
     assert found.point.residual is None and found.score == np.inf
+
+
+# ---- a rendered target -------------------------------------------------------------------------------------
+
+FAR = (6, 52)
+TEXEL = 360 / WIDTH
+NEAR = 2 * TEXEL
+
+
+class Found:
+    """What a search, and the steps from what it found, make of a map and a picture."""
+
+    def __init__(self, transport, image, wanted, weight=None):
+        layers = Layers.of(image[:ROWS], (0, HEIGHT), cycles=6)
+        encoded = layers.start()
+        likelihood = Likelihood(on_average_one(weight, wanted.shape[:2]))
+        problem = Problem(layers, transport, image, wanted, likelihood, saturates=True)
+        likeliest = search.search(problem, problem.state(encoded))
+        solution = gauss_newton.solve(problem, encoded, run=likeliest.run)
+        while (likelier := search.further(problem, solution.run)) is not None:
+            solution = gauss_newton.solve(problem, encoded, run=likelier.run)
+        self.state = state = problem.state(solution.params)
+        self.name, self.own = likeliest.name, layers.lights.own
+        self.lit = {k: problem.direction(state, k) for k in problem.shining(state)}
+        self.flux = np.exp(state["flux"])
+        self.decoded = layers.decode(solution.params).numpy()
+        assert all(np.isfinite(value).all() for value in state.values())
+        assert np.isfinite(self.decoded).all() and (self.decoded >= 0).all()
+
+
+@pytest.fixture(scope="module")
+def followed(traced):
+    wanted = rendered(traced(), sky(FAR))
+    return wanted, Found(traced(), sky(SUN), wanted)
+
+
+PLACES = {
+    "the other side of the sphere": FAR,
+    "across the seam": (5, 62),
+    "the horizon": (15, 33),
+}
+
+
+@pytest.mark.parametrize("where", PLACES)
+def test_a_sun_is_found_wherever_it_went(where, transport, followed):
+    """To a fraction of a texel; it keeps its flux, and there is one."""
+    place = PLACES[where]
+    assert angle(DIRECTIONS[place], DIRECTIONS[SUN]) > NEAR  # staying would not do
+    found = followed[1] if place == FAR else Found(transport, sky(SUN), rendered(transport, sky(place)))
+    assert found.own == 1 and [*found.lit] == [0]
+    assert angle(found.lit[0], DIRECTIONS[place]) < 0.5 * TEXEL
+    if where != "the horizon":  # of what is there half lies below the rows that may change
+        np.testing.assert_allclose(found.flux[0], 1, rtol=0.15)
+
+
+def test_the_map_that_is_found_gives_the_picture(transport, followed):
+    """Most of the way: a tenth of the error that there was."""
+    wanted, found = followed
+    composed = sky(SUN)
+    composed[:ROWS] = found.decoded
+    before, after = (rendered(transport, image) for image in (sky(SUN), composed))
+    assert np.square(after - wanted).mean() < 0.1**2 * np.square(before - wanted).mean()
+
+
+def test_a_mask_that_excludes_everything_leaves_the_sky(transport, followed):
+    found = Found(transport, sky(SUN), followed[0], np.zeros((PIXELS, PIXELS, 1), np.float32))
+    np.testing.assert_array_equal(found.state["gain"], 0)
+
+
+def test_a_mask_tells_which_pixels_count(transport, followed):
+    """What is left out may be anything: it has no say."""
+    wanted = followed[0]
+    mask = np.ones((PIXELS, PIXELS, 1), np.float32)
+    mask[: PIXELS // 4] = 0
+    spoilt = np.where(mask > 0, wanted, 0).astype(np.float32)
+    found, unmasked = (Found(transport, sky(SUN), spoilt, weight) for weight in (mask, None))
+    assert angle(found.lit[0], DIRECTIONS[FAR]) < NEAR
+    assert unmasked.decoded.mean() < 0.95 * found.decoded.mean()  # without the mask the black pixels count
+
+
+def test_a_black_picture_makes_a_dark_sky(transport):
+    found = Found(transport, sky(SUN), np.zeros((PIXELS, PIXELS, 3), np.float32))
+    assert found.decoded.mean() < 0.2 * sky()[:ROWS].mean()
+
+
+def test_a_sun_below_the_rows_that_may_change_is_no_light_to_move(transport):
+    assert Found(transport, sky((20, 7)), rendered(transport, sky())).own == 0

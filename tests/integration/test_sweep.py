@@ -285,23 +285,20 @@ def test_an_interrupted_driver_lets_its_jobs_write_their_checkpoints(stub, numbe
     assert json.loads((folder / "done.json").read_text())["resumed"] is True
 
 
-@pytest.mark.parametrize("state", ["unusable", "other"])
-def test_a_checkpoint_that_is_no_use_is_removed_for_a_second_try(state, stub):
-    one = stub.jobs(1)[0]
-    one.folder(stub.out).mkdir(parents=True)
-    (one.folder(stub.out) / "checkpoint.npz").write_text(state)
-    assert stub.run(1)[0] == ["done"]
-    assert stub.counts("begin", 1) == [2] and stub.counts("checkpoint", 1) == [1]
-
-
-def test_a_checkpoint_outlives_a_full_disk(stub):
-    """Any other input error ends with 3, too."""
-    one = stub.jobs(1)[0]
-    one.folder(stub.out).mkdir(parents=True)
-    (one.folder(stub.out) / "checkpoint.npz").write_text("full")
-    assert stub.run(1)[0] == ["failed"] and stub.counts("begin", 1) == [1]
-    assert (one.folder(stub.out) / "checkpoint.npz").read_text() == "full"
-    assert len(json.loads((one.folder(stub.out) / "failed.json").read_text())["error"]) < 350
+@pytest.mark.parametrize(("state", "outcome"), [("unusable", "done"), ("other", "done"), ("full", "failed")])
+def test_a_checkpoint_that_is_no_use_is_removed_for_a_second_try_and_outlives_a_full_disk(
+    state, outcome, stub
+):
+    """Exit code 3 is that of any input error."""
+    folder = stub.jobs(1)[0].folder(stub.out)
+    folder.mkdir(parents=True)
+    (folder / "checkpoint.npz").write_text(state)
+    assert stub.run(1)[0] == [outcome] and stub.counts("checkpoint", 1) == [1]
+    assert stub.counts("begin", 1) == [1 if state == "full" else 2]
+    assert (folder / "checkpoint.npz").exists() == (state == "full")
+    if state == "full":
+        assert (folder / "checkpoint.npz").read_text() == "full"
+        assert len(json.loads((folder / "failed.json").read_text())["error"]) < 350
 
 
 def test_what_a_checkpoint_that_is_no_use_is_told_by_is_what_envedit_says(tmp_path):

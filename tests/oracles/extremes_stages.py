@@ -4,7 +4,6 @@ A stage returns normally where all that it made is finite and correct, and raise
 """
 
 import functools
-from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -28,29 +27,6 @@ FILM = (8, 6)
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 STEPS = 25
 """Of the edit loop; it stops at the 20th that is not finite in a row."""
-
-
-# ---- how a cell ends -------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """What a cell ends in: ``done`` or ``refused``.
-
-    ``words`` are part of the refusal's message; ``says`` is a sentence for people.
-    """
-
-    kind: str
-    says: str = ""
-    error: type | None = None
-    words: str = ""
-
-
-def refused(error, words, says=""):
-    return Outcome("refused", says, error, words)
-
-
-DONE = Outcome("done")
 
 
 # ---- what stages share -----------------------------------------------------------------------------------

@@ -61,18 +61,6 @@ def transport(height: int, width: int) -> LightTransport:
     return traced
 
 
-@functools.cache
-def dense(height: int, width: int) -> np.ndarray:
-    """Return T (3, pixels, texels) float64, column by column of unit maps."""
-    traced, texels = transport(height, width), height * width
-    found = np.empty((3, FILM[0] * FILM[1], texels))
-    for texel in range(texels):
-        unit = np.zeros((height, width, 3), np.float32)
-        unit.reshape(-1, 3)[texel] = 1
-        found[:, :, texel] = traced.linear(single(unit)).numpy().reshape(-1, 3).T
-    return found
-
-
 # ---- reading, checking, writing --------------------------------------------------------------------------
 
 
@@ -142,14 +130,12 @@ def ssim_loss(x, y):
     return ssim.Ssim(y)(x)
 
 
-# Those of the edit, and those of the fit by the names of its weights.
-LOSSES = {"ssim": ssim_loss, "log_ssim": ssim_loss, **losses.LOSSES}
-LOSSES |= {"log_mse": losses.image_l2, "hdr": losses.image_l1}
+LOSSES = {"ssim": ssim_loss, **losses.LOSSES}
 
 
 def plain(name, x, y):
     """Return value and gradient of a loss in float64; SSIM by the same code in double precision."""
-    if name in ("ssim", "log_ssim"):
+    if name == "ssim":
         leaf = mi.TensorXd(np.asarray(x, np.float64))
         dr.enable_grad(leaf)
         value = ssim.Ssim(mi.TensorXd(np.asarray(y, np.float64)))(leaf)
@@ -157,9 +143,9 @@ def plain(name, x, y):
         return float(value[0]), np.array(dr.grad(leaf))
     x, y = np.asarray(x, np.float64), np.asarray(y, np.float64)
     d, n = x - y, x.size
-    if name in ("image_l1", "hdr"):
+    if name == "image_l1":
         return np.abs(d).mean(), np.sign(d) / n
-    if name in ("image_l2", "log_mse"):
+    if name == "image_l2":
         return np.square(d).mean(), 2 * d / n
     if name == "luminance":
         difference = (d @ LUMINANCE).sum()

@@ -10,10 +10,6 @@ from tests.oracles.plain import lookup
 from tests.oracles.statistics import disagreement, normal_square, student
 
 # ---- statistics (also used by the tests of the renderers) --------------------------------------------------
-#
-# Two renderers agree if the differences of independent pictures, seed by seed, have mean zero. The t of
-# Student needs normal noise, which a pixel that a firefly visits does not have, but blocks of pixels and the
-# whole picture have.
 
 
 def test_student_has_the_quantiles_of_the_tables():

@@ -14,12 +14,11 @@ from envedit.targets import initial_rendering, target
 from tests.oracles import ROOT, extremes
 from tests.oracles.extremes_stages import transport
 from tests.oracles.runs import settings_of
-from tests.oracles.tiers import slow_but
 
 pytestmark = pytest.mark.usefixtures("own_cache", "own_core")
 
 
-@pytest.mark.parametrize(("name", "stage"), slow_but(extremes.CELLS, "NaN"))
+@pytest.mark.parametrize(("name", "stage"), extremes.CELLS)
 def test_cell(name, stage, tmp_path):
     """A stage returns where all is right; wrong numbers fail an assertion of its own."""
     if (name, stage) not in extremes.REFUSALS:

@@ -5,15 +5,13 @@ A stage returns normally where all that it made is finite and correct, and raise
 
 import functools
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 import OpenEXR
 
 from envedit import config, representations
 from envedit.core import latlong
 from envedit.images import images
-from envedit.losses import losses, metrics, ssim
+from envedit.losses import metrics
 from envedit.renderers import StoredRenderer
 from envedit.representations.layers.layers import Layers
 from envedit.scene import scene
@@ -121,61 +119,6 @@ def fitted(m, folder):
     assert np.isfinite(got).all() and got.min() >= 0
     assert np.log(got.max(initial=0) + 0.01) <= normal.low + normal.span + 1e-3
     assert len(told) == 2 and np.isfinite(told).all() and told[1] <= told[0]
-
-
-# ---- losses ----------------------------------------------------------------------------------------------
-
-
-def ssim_loss(x, y):
-    return ssim.Ssim(y)(x)
-
-
-LOSSES = {"ssim": ssim_loss, **losses.LOSSES}
-
-
-def plain(name, x, y):
-    """Return value and gradient of a loss in float64; SSIM by the same code in double precision."""
-    if name == "ssim":
-        leaf = mi.TensorXd(np.asarray(x, np.float64))
-        dr.enable_grad(leaf)
-        value = ssim.Ssim(mi.TensorXd(np.asarray(y, np.float64)))(leaf)
-        dr.backward(value)
-        return float(value[0]), np.array(dr.grad(leaf))
-    x, y = np.asarray(x, np.float64), np.asarray(y, np.float64)
-    d, n = x - y, x.size
-    if name == "image_l1":
-        return np.abs(d).mean(), np.sign(d) / n
-    if name == "image_l2":
-        return np.square(d).mean(), 2 * d / n
-    if name == "luminance":
-        difference = (d @ LUMINANCE).sum()
-        return abs(difference), np.broadcast_to(np.sign(difference) * LUMINANCE, x.shape)
-    if name == "l1":
-        return np.abs(x).sum(), np.sign(x)
-    if name == "tv":
-        across, down = np.roll(x, -1, axis=1) - x, np.diff(x, axis=0, append=x[-1:])
-        slope = np.roll(np.sign(across), 1, axis=1) - np.sign(across) - np.sign(down)
-        slope[1:] += np.sign(down)[:-1]
-        return (np.abs(across) + np.abs(down)).mean(), slope / n
-    assert name == "change"
-    floor = max(0.01 * y.mean(), 1e-12)
-    distance = np.log((x + floor) / (y + floor))
-    root = np.sqrt(np.square(distance) + 0.05**2)
-    return (root - 0.05).mean(), distance / root / (x + floor) / n
-
-
-def loss_and_gradient(name, x, y):
-    """Return value and gradient of a loss of the package in float32."""
-    leaf = single(x)
-    dr.enable_grad(leaf)
-    value = LOSSES[name](leaf, single(y))
-    dr.backward(value)
-    return float(value[0]), np.array(dr.grad(leaf))
-
-
-def ssim_rounding(x) -> float:
-    """Return the rounding of SSIM's gradient: a window of no contrast cancels terms of |x| / C2."""
-    return 1e-7 * float(np.abs(x).max()) / 0.03**2 / np.size(x)
 
 
 # ---- the loop --------------------------------------------------------------------------------------------

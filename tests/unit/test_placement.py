@@ -8,7 +8,6 @@ from envedit.representations.layers.placed_lights import angles, direction
 from envedit.scene import placement, scene
 from envedit.scene.placement import NoPlaceError
 from tests.oracles.builders import AHEAD, BALL, HALF, LIGHT, ORIGIN, RIGHT, SENSOR, UP, write_scene
-from tests.oracles.tiers import slow_but
 from tests.oracles.users_scenes import HIDDEN
 
 FLOOR = (
@@ -175,7 +174,7 @@ def mirrored(x, y):
     return ray - 2 * (ray @ normal) * normal
 
 
-@pytest.mark.parametrize("kind", slow_but(GLOSSY, *list(GLOSSY)[:1]))
+@pytest.mark.parametrize("kind", GLOSSY)
 def test_it_is_the_direction_of_the_mirror(kind, tmp_path):
     lit = ball(tmp_path, GLOSSY[kind])
     for place in ((0.45, 0.4), (0.56, 0.45), (0.5, 0.55)):

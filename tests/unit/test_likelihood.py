@@ -52,6 +52,17 @@ def test_misfit_is_that_of_the_formula(sigma, painted, mean, rng):
     assert one.robust != painted
 
 
+@pytest.mark.parametrize("change", [0.2, 3.0])
+def test_the_mean_is_scaled_to_have_the_gradient_of_its_loss(change):
+    one, coverage = of_stroke()
+    residual, h = VISIBLE * (1 - coverage) * change * np.array([1.0, -0.5, 0.2]), 1e-6
+    share, mean = one.linear_mean(residual)
+    for c in range(3):
+        ends = [residual + sign * h * (np.arange(3) == c) * (1 - coverage) for sign in (1, -1)]
+        slope = np.subtract(*(likelihood.of_mean(one.mean(end)) for end in ends)) / (2 * h)
+        assert 2 * (share * (1 - coverage)).sum() * mean[c] == pytest.approx(slope, rel=1e-4, abs=1e-6)
+
+
 def test_noise_of_squares_is_the_most_likely(rng):
     """No other sigma makes the residual likelier, and its square is the weighted mean square."""
     one = replace(of_stroke()[0], least_noise=1e-3)

@@ -14,12 +14,11 @@ from envedit.core import latlong
 from envedit.scene import camera_paths, scene
 from envedit.transport.exact_columns import Columns, ColumnStore
 from tests.oracles.plain import lookup
-from tests.oracles.scenes import build, picture, references, stage
+from tests.oracles.scenes import DEPTH, HEIGHT, WIDTH, build, picture, references, stage
 from tests.oracles.statistics import disagreement
 
 pytestmark = pytest.mark.usefixtures("own_core")
 
-HEIGHT, WIDTH = 16, 32
 SUN = np.array([0.5, 0.6, 0.62]) / np.linalg.norm([0.5, 0.6, 0.62])
 
 
@@ -28,9 +27,8 @@ def lobe(d, sharpness):
     return np.exp(sharpness * (d @ SUN - 1))[..., None]
 
 
-def smooth_sky(height=HEIGHT, width=WIDTH):
-    """A sky without texels: the same function of direction on any grid."""
-    d = latlong.directions(height, width)
+def smooth_sky():
+    d = latlong.directions(HEIGHT, WIDTH)
     return (0.3 + lobe(d, 6) * [1, 0.9, 0.7] + 0.2 * d[..., :1] ** 2).astype(np.float32)
 
 
@@ -44,12 +42,10 @@ def rmse(pictures, wanted):
     return np.sqrt(np.mean(np.square(np.asarray(pictures, np.float64) - wanted))) / wanted.mean()
 
 
-def reference(s, image, depth=4):
+def reference(s, image):
     """Render without visible noise: 0.08 % of the mean at 144 pixels, less than a tenth of what is told."""
-    spp = 16384
-    return np.mean(
-        [s.render(image, spp=spp, seed=k, max_depth=depth) for k in (1, 2)], axis=0, dtype=np.float64
-    )
+    both = [s.render(image, spp=16384, seed=k, max_depth=DEPTH) for k in (1, 2)]
+    return np.mean(both, axis=0, dtype=np.float64)
 
 
 @pytest.fixture(scope="module")
@@ -67,9 +63,9 @@ def wanted(matte):
 SAMPLES = (4, 16, 64, 256)
 
 
-def transport_errors(s, wanted, samples=SAMPLES):
+def transport_errors(s, wanted):
     image = smooth_sky()
-    return [rmse([picture(build(s, spp=n, seed=seed), image) for seed in range(4)], wanted) for n in samples]
+    return [rmse([picture(build(s, spp=n, seed=seed), image) for seed in range(4)], wanted) for n in SAMPLES]
 
 
 @pytest.mark.slow

@@ -11,7 +11,6 @@ from envedit.scene import scene
 from envedit.transport import recording, sampling_plan
 from envedit.transport.light_transport import LightTransport
 from tests.oracles.builders import BALL, LIGHT, SENSOR, write_scene
-from tests.oracles.tiers import slow_but
 
 LAMP = """<shape type="sphere"><point name="center" x="0" y="3" z="0"/><float name="radius" value="0.3"/>
     <emitter type="area"><rgb name="radiance" value="6, 3, 12"/></emitter></shape>"""
@@ -43,7 +42,7 @@ def nothing_is_traced(monkeypatch):
     monkeypatch.setattr(scene.Scene, "render", refuse)
 
 
-@pytest.mark.parametrize("lamp", slow_but([True, False], True))
+@pytest.mark.parametrize("lamp", [True, False])
 def test_a_second_build_traces_nothing_and_gives_the_same_bits(lamp, tmp_path, rng, monkeypatch):
     """Under a lamp the light that is not the map's is kept as well."""
     s = scene.load(write_scene(tmp_path, SENSOR, BALL, *([LAMP] if lamp else []), LIGHT))

@@ -10,10 +10,6 @@ from tests.oracles.plain import lookup
 from tests.oracles.statistics import disagreement, normal_square, student
 
 # ---- statistics (also used by the tests of the renderers) --------------------------------------------------
-#
-# Two renderers agree if the differences of independent pictures, seed by seed, have mean zero. The t of
-# Student needs normal noise, which a pixel that a firefly visits does not have, but blocks of pixels and the
-# whole picture have.
 
 
 def test_student_has_the_quantiles_of_the_tables():
@@ -75,10 +71,10 @@ def test_lattice_fills_the_square_more_evenly_than_random_points():
 # ---- tracing -----------------------------------------------------------------------------------------------
 
 
-def stage(*shapes, film=None, origin=(0, 1, 6), target=(0, 0, 0), fov=40):
-    to_world = mi.ScalarTransform4d().look_at(origin=list(origin), target=list(target), up=[0, 1, 0])
+def stage(*shapes, film=None, target=(0, 0, 0)):
+    to_world = mi.ScalarTransform4d().look_at(origin=[0, 1, 6], target=list(target), up=[0, 1, 0])
     film = {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}} | (film or {})
-    sensor = {"type": "perspective", "fov": fov, "to_world": to_world, "film": film}
+    sensor = {"type": "perspective", "fov": 40, "to_world": to_world, "film": film}
     objects = {f"shape{i}": shape for i, shape in enumerate(shapes)}
     return scene.load({"type": "scene", "sensor": sensor, "light": {"type": "constant"}, **objects})
 

@@ -18,7 +18,7 @@ from envedit.solve.likelihood import VISIBLE, Likelihood
 from envedit.solve.map_problem import Problem
 from envedit.solve.prior import of_paint
 from envedit.targets.pixel_weights import pixel_weight
-from tests.oracles.dense_transport import DenseTransport
+from tests.oracles.dense_transport import DenseTransport, node_shares
 
 pytestmark = pytest.mark.usefixtures("own_core")
 
@@ -48,13 +48,8 @@ def gaussian(rng, freedom, kind="rendered"):
     start = problem.state(layers.start())
 
     # ---- J, W and y: pixels, channel after channel; the mean of the rest, in units of what is visible
-    hats = []
-    for level, (rows, columns) in enumerate(problem.sizes):
-        share = np.zeros((GRID[0] * GRID[1], rows * columns))
-        for node, weight in layers.gain.hats(level, GRID):
-            np.add.at(share, (np.arange(len(node)), node), weight)
-        hats.append(share)
-    of_channel = SLOPE * LEVEL * np.float64(transport.weights[0]) @ np.concatenate(hats, axis=1)
+    of_nodes = np.concatenate(node_shares(problem), axis=1)
+    of_channel = SLOPE * LEVEL * np.float64(transport.weights[0]) @ of_nodes
     y = SLOPE * (np.float64(picture) - before).reshape(-1, 3).T
     of_pixel = likelihood.weight.ravel() / (likelihood.area * sigma**2)
     if kind == "painted":

@@ -4,23 +4,12 @@ import numpy as np
 import pytest
 
 from envedit import config, representations
-from envedit.losses import display_curve
 from envedit.renderers import StoredRenderer
 from envedit.scene import scene
 from envedit.solve import adam_loop
 from envedit.targets import painted_image
 from envedit.transport.light_transport import LightTransport
-from tests.oracles.extremes_stages import (
-    FILM,
-    close,
-    loss_and_gradient,
-    matte,
-    plain,
-    single,
-    sky,
-    ssim_rounding,
-    transport,
-)
+from tests.oracles.extremes_stages import FILM, close, matte, single, sky, transport
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("own_cache", "own_core")]
 
@@ -55,10 +44,6 @@ def test_one_value_in_every_pixel_is_followed(value, initial):
     found = painted_image.given(picture, SHAPE, initial)
     np.testing.assert_array_equal(found.picture, picture)
     assert (found.coverage == 1).all()
-    shown = [display_curve.to_display(single(e)).numpy() for e in (initial, picture)]
-    for name in ("image_l1", "image_l2", "ssim"):
-        for got, wanted in zip(loss_and_gradient(name, *shown), plain(name, *shown), strict=True):
-            close(got, wanted, 1e-5, ssim_rounding(np.maximum(*shown)) if name == "ssim" else 0)
     light = follow(picture).sum(dtype=np.float64) - sky().sum(dtype=np.float64)
     assert light < 0 if value == 0 else light > 0
 

@@ -7,7 +7,6 @@ import pytest
 from envedit.core.errors import NumericalError
 from envedit.scene import film, scene
 from tests.oracles.builders import BALL, LIGHT, SENSOR, write_scene
-from tests.oracles.tiers import slow_but
 
 pytestmark = pytest.mark.usefixtures("own_core")
 
@@ -29,8 +28,8 @@ def lit_by_a_sun(folder, rng, part, sampler="multijitter", size=None):
     return loaded, sky
 
 
-@pytest.mark.parametrize("part", slow_but([BOX, WIDE, SIGNED], WIDE), ids=["box", "wide", "signed"])
-@pytest.mark.parametrize("sampler", slow_but(["independent", "multijitter"], "multijitter"))
+@pytest.mark.parametrize("part", [BOX, WIDE, SIGNED], ids=["box", "wide", "signed"])
+@pytest.mark.parametrize("sampler", ["independent", "multijitter"])
 def test_pixels_are_those_of_mitsuba_with_the_same_seed(part, sampler, tmp_path, rng):
     loaded, _ = lit_by_a_sun(tmp_path, rng, part, sampler)
     integrator = mi.load_dict({"type": "path", "max_depth": 4})

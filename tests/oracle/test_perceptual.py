@@ -239,11 +239,6 @@ def test_a_backbone_is_loaded_from_a_file(backbones, folder):
     x, y, _ = drawn.images(40, 40)
     expected = Lpips("alex", backbones["alex"], folder / "alex.npz")(x, y)
     assert Lpips("alex", folder / "alexnet.npz", folder / "alex.npz")(x, y) == expected
-    del state["features.3.bias"], state["features.0.bias"]
-    np.savez(folder / "less.npz", **state)
-    with pytest.raises(InputError) as info:
-        Backbone.load("alex", folder / "less.npz")
-    assert "no 'features.0.bias' and 1 more of 10 tensors" in str(info.value)
     with pytest.raises(InputError, match=r"'features.0.weight' has the shape \(64, 3, 3, 3\), in AlexNet"):
         np.savez(folder / "mixed.npz", **(state_of("alex") | {"features.0.weight": np.zeros((64, 3, 3, 3))}))
         Backbone.load("alex", folder / "mixed.npz")

@@ -158,11 +158,8 @@ def map_of(parts, folder, **keys):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "parts", [(SENSOR, BALL, CONSTANT), (Z_UP, BALL, GROUND, SUN)], ids=["constant", "sunsky"]
-)
-def test_a_light_that_is_no_file_is_the_map(parts, tmp_path):
-    lit, radiance, notes = map_of((PATH, *parts), tmp_path)
+def test_a_light_that_is_no_file_is_the_map(tmp_path):
+    lit, radiance, notes = map_of((PATH, Z_UP, BALL, GROUND, SUN), tmp_path)
     close(lit.render(radiance, SPP, 3), plain(tmp_path / "test.xml"), 0.015)
     assert "map: the scene's own light, " in notes[0]
 

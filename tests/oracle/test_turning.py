@@ -43,12 +43,6 @@ def test_the_turn_is_found(texels, traced, rng):
     assert found.error < 0.003 and (found.left < 0.2 or texels in (0.0, 63.9))
 
 
-def test_a_whole_number_of_texels_is_a_roll(traced, rng):
-    image = sky(rng)
-    found = found_of(traced, image, rendered(traced, np.roll(image, -9, axis=1)))
-    assert latlong.rotate(image, found.degrees).tobytes() == np.roll(image, -9, axis=1).tobytes()
-
-
 def test_a_glance_shows_what_t_does_where_blocks_are_pixels_and_cells_texels(traced, rng):
     """Against every turn rendered through T itself."""
     image, picture = sky(rng), rendered(traced, sky(np.random.default_rng(5)))

@@ -20,7 +20,6 @@ from envedit.images import images
 from envedit.scene import scene
 from envedit.scene.usd import conversion
 from envedit.scene.usd import stage as usd_stage
-from tests.oracles.tiers import slow_but
 
 pytestmark = pytest.mark.usefixtures("own_cache")
 
@@ -148,8 +147,8 @@ def refusal(stage):
 # ---- Camera ------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("offset", [(0.0, 0.0), pytest.param((8.0, -3.0), marks=pytest.mark.slow)])
-@pytest.mark.parametrize("projection", slow_but(["perspective", "orthographic"], "perspective"))
+@pytest.mark.parametrize("offset", [(0.0, 0.0), (8.0, -3.0)])
+@pytest.mark.parametrize("projection", ["perspective", "orthographic"])
 def test_a_camera_puts_a_point_where_usd_does(offset, projection, tmp_path):
     stage = new_stage(tmp_path)
     camera = add_camera(stage, move=(1, 2, 9), turns=[((0, 1, 0), 20), ((1, 0, 0), -15)], scale=3.0)
@@ -200,7 +199,7 @@ def test_cameras_are_named_where_there_are_several(tmp_path, capsys):
 # ---- Light -------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("unit", slow_but([1.0, 0.01], 0.01))
+@pytest.mark.parametrize("unit", [1.0, 0.01])
 def test_a_white_dome_lights_a_white_plane_with_its_radiance(unit, tmp_path):
     stage = new_stage(tmp_path, unit=unit)
     add_square(stage, half=100 / unit)

@@ -88,3 +88,15 @@ class DenseTransport:
         overview = Overview(self.shape, self.grid)
         overview.matrix = overview.summed(matrix)
         return overview
+
+
+def node_shares(problem):
+    """Return every node's share of every texel of a problem, by levels: (texels, nodes) each."""
+    height, width = problem.transport.grid
+    found = []
+    for level, size in enumerate(problem.sizes):
+        share = np.zeros((height * width, np.prod(size)))
+        for node, weight in problem.layers.gain.hats(level, (height, width)):
+            np.add.at(share, (np.arange(len(node)), node), weight)
+        found.append(share)
+    return found

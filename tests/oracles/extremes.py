@@ -1,12 +1,9 @@
-"""The matrix of extremes as data: maps, stages, and what happens where they meet.
-
-``python -m tests.oracles.extremes > docs/extremes.md`` writes the table.
-"""
+"""The matrix of extremes as data: maps, and where a stage refuses one; ``docs/extremes.md`` has the same."""
 
 import numpy as np
 
 from envedit.core.errors import InputError, NumericalError
-from tests.oracles.extremes_stages import DONE, STAGES, Outcome, refused, sky
+from tests.oracles.extremes_stages import STAGES, sky
 
 # ---- maps ------------------------------------------------------------------------------------------------
 
@@ -48,86 +45,33 @@ MAPS = {
 }
 """A texel of that value in a smooth sky of 16 x 32 unless said otherwise; 4096 is 16 rows of such a map."""
 
-# ---- what happens ----------------------------------------------------------------------------------------
+# ---- what is refused --------------------------------------------------------------------------------------
 
 
 AT = "the first at row 5, column 9"
 NOT_FINITE, NEGATIVE = ("NaN", "+Inf", "-Inf"), ("-5", "all negative")
 
 
-def _declare():
-    """List the cells that end otherwise than in a finite and correct result."""
+def _refusals():
+    """Return the cells that do not end in a finite and correct result: error and words of its message."""
     cells = {}
+    wrong = InputError, f"1 texel is not finite, {AT}: repair the map"
     for name in NOT_FINITE:
-        cells[name, "read"] = refused(
-            InputError,
-            f"1 texel is NaN or infinite, {AT}; repair the map",
-            "`[input] repair = true` takes the mean of its neighbours instead, "
-            "or the brightest light for +Inf.",
-        )
-        wrong = refused(InputError, f"1 texel is not finite, {AT}: repair the map")
+        cells[name, "read"] = InputError, f"1 texel is NaN or infinite, {AT}; repair the map"
         cells[name, "fit"] = cells[name, "edit loop"] = wrong
-        cells[name, "write"] = refused(NumericalError, f"not written: 1 texel is not finite, {AT}")
-        cells[name, "metrics"] = refused(InputError, f"1 texel is not finite, {AT}; repair the image first")
-    first_of_all = "the first at row 0, column 0"
-    for name, texels_are, first in (
-        ("-5", "1 texel is", AT),
-        ("all negative", "512 texels are", first_of_all),
-    ):
-        wrong = refused(InputError, f"{texels_are} negative, {first}: set them to 0")
-        cells[name, "fit"] = cells[name, "edit loop"] = wrong
-    cells["1e30", "edit loop"] = Outcome(
-        "done",
-        "Where a pixel is dark beside such a light, the gradient of the light's place has no square in "
-        "single precision: an edit then stops after 20 steps that are refused, with a `NumericalError`.",
-    )
-    bright = refused(InputError, f"1 texel is brighter than 1.27e+30, {AT}: scale the map down")
+        cells[name, "write"] = NumericalError, f"not written: 1 texel is not finite, {AT}"
+        cells[name, "metrics"] = InputError, f"1 texel is not finite, {AT}; repair the image first"
+    counted = f"1 texel is negative, {AT}", "512 texels are negative, the first at row 0, column 0"
+    for name, texels in zip(NEGATIVE, counted, strict=True):
+        cells[name, "fit"] = cells[name, "edit loop"] = InputError, f"{texels}: set them to 0"
+    bright = InputError, f"1 texel is brighter than 1.27e+30, {AT}: scale the map down"
     cells["3e38", "fit"] = cells["3e38", "edit loop"] = bright
-    small = "an environment map of {} texels is too small for Mitsuba"
     for name, size in (("width 2", "2 x 1"), ("width 3", "3 x 2")):
-        cells[name, "edit loop"] = refused(InputError, small.format(size))
-    cells["width 2", "read"] = refused(InputError, "2 x 1 texels are too few for a map; use at least 6 x 3")
-    cells["width 3", "read"] = refused(InputError, "3 x 2 texels are too few for a map; use at least 6 x 3")
-    cells["width 5", "read"] = refused(InputError, "a lat-long map is 2:1, this is 5 x 4")
+        cells[name, "edit loop"] = InputError, f"an environment map of {size} texels is too small for Mitsuba"
+        cells[name, "read"] = InputError, f"{size} texels are too few for a map; use at least 6 x 3"
+    cells["width 5", "read"] = InputError, "a lat-long map is 2:1, this is 5 x 4"
     return cells
 
 
-EXCEPTIONS = _declare()
+REFUSALS = _refusals()
 CELLS = [(name, stage) for name in MAPS for stage in STAGES]
-
-
-def expected(name, stage):
-    return EXCEPTIONS.get((name, stage), DONE)
-
-
-# ---- the document ----------------------------------------------------------------------------------------
-
-HEAD = """# Extremes
-
-What happens with odd maps, written by the tests (`python -m tests.oracles.extremes > docs/extremes.md`).
-*ok*: the result is finite and correct. Rows: a texel of that value in a smooth sky of 32 x 16 texels, or as
-named. Columns:
-"""
-
-
-def document():
-    """Return the page: maps that end alike in a row, with numbered notes."""
-    notes, rows = [], {}
-    for name in MAPS:
-        marks = []
-        for stage in STAGES:
-            outcome = expected(name, stage)
-            mark = "ok" if outcome.kind == "done" else outcome.kind
-            if outcome.says:
-                notes += [outcome.says] if outcome.says not in notes else []
-                mark += f" [{notes.index(outcome.says) + 1}]"
-            marks.append(mark)
-        rows.setdefault(" | ".join(marks), []).append(name)
-    lines = [HEAD, *(f"- **{stage}**: {' '.join(act.__doc__.split())}" for stage, act in STAGES.items())]
-    lines += ["", f"| | {' | '.join(STAGES)} |", "|---" * (len(STAGES) + 1) + "|"]
-    lines += [f"| {', '.join(alike)} | {marks} |" for marks, alike in rows.items()]
-    return "\n".join([*lines, "", *(f"{i}. {note}" for i, note in enumerate(notes, 1)), ""])
-
-
-if __name__ == "__main__":
-    print(document(), end="")

@@ -4,17 +4,14 @@ A stage returns normally where all that it made is finite and correct, and raise
 """
 
 import functools
-from dataclasses import dataclass
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 import OpenEXR
 
 from envedit import config, representations
 from envedit.core import latlong
 from envedit.images import images
-from envedit.losses import losses, metrics, ssim
+from envedit.losses import metrics
 from envedit.renderers import StoredRenderer
 from envedit.representations.layers.layers import Layers
 from envedit.scene import scene
@@ -28,29 +25,6 @@ FILM = (8, 6)
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 STEPS = 25
 """Of the edit loop; it stops at the 20th that is not finite in a row."""
-
-
-# ---- how a cell ends -------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """What a cell ends in: ``done`` or ``refused``.
-
-    ``words`` are part of the refusal's message; ``says`` is a sentence for people.
-    """
-
-    kind: str
-    says: str = ""
-    error: type | None = None
-    words: str = ""
-
-
-def refused(error, words, says=""):
-    return Outcome("refused", says, error, words)
-
-
-DONE = Outcome("done")
 
 
 # ---- what stages share -----------------------------------------------------------------------------------
@@ -83,18 +57,6 @@ def transport(height: int, width: int) -> LightTransport:
     if (height, width) == (16, 32):
         return traced.with_probed(np.array([0 * 32 + 7, 5 * 32, 7 * 32 + 20, 5 * 32 + 9]))
     return traced
-
-
-@functools.cache
-def dense(height: int, width: int) -> np.ndarray:
-    """Return T (3, pixels, texels) float64, column by column of unit maps."""
-    traced, texels = transport(height, width), height * width
-    found = np.empty((3, FILM[0] * FILM[1], texels))
-    for texel in range(texels):
-        unit = np.zeros((height, width, 3), np.float32)
-        unit.reshape(-1, 3)[texel] = 1
-        found[:, :, texel] = traced.linear(single(unit)).numpy().reshape(-1, 3).T
-    return found
 
 
 # ---- reading, checking, writing --------------------------------------------------------------------------
@@ -157,63 +119,6 @@ def fitted(m, folder):
     assert np.isfinite(got).all() and got.min() >= 0
     assert np.log(got.max(initial=0) + 0.01) <= normal.low + normal.span + 1e-3
     assert len(told) == 2 and np.isfinite(told).all() and told[1] <= told[0]
-
-
-# ---- losses ----------------------------------------------------------------------------------------------
-
-
-def ssim_loss(x, y):
-    return ssim.Ssim(y)(x)
-
-
-# Those of the edit, and those of the fit by the names of its weights.
-LOSSES = {"ssim": ssim_loss, "log_ssim": ssim_loss, **losses.LOSSES}
-LOSSES |= {"log_mse": losses.image_l2, "hdr": losses.image_l1}
-
-
-def plain(name, x, y):
-    """Return value and gradient of a loss in float64; SSIM by the same code in double precision."""
-    if name in ("ssim", "log_ssim"):
-        leaf = mi.TensorXd(np.asarray(x, np.float64))
-        dr.enable_grad(leaf)
-        value = ssim.Ssim(mi.TensorXd(np.asarray(y, np.float64)))(leaf)
-        dr.backward(value)
-        return float(value[0]), np.array(dr.grad(leaf))
-    x, y = np.asarray(x, np.float64), np.asarray(y, np.float64)
-    d, n = x - y, x.size
-    if name in ("image_l1", "hdr"):
-        return np.abs(d).mean(), np.sign(d) / n
-    if name in ("image_l2", "log_mse"):
-        return np.square(d).mean(), 2 * d / n
-    if name == "luminance":
-        difference = (d @ LUMINANCE).sum()
-        return abs(difference), np.broadcast_to(np.sign(difference) * LUMINANCE, x.shape)
-    if name == "l1":
-        return np.abs(x).sum(), np.sign(x)
-    if name == "tv":
-        across, down = np.roll(x, -1, axis=1) - x, np.diff(x, axis=0, append=x[-1:])
-        slope = np.roll(np.sign(across), 1, axis=1) - np.sign(across) - np.sign(down)
-        slope[1:] += np.sign(down)[:-1]
-        return (np.abs(across) + np.abs(down)).mean(), slope / n
-    assert name == "change"
-    floor = max(0.01 * y.mean(), 1e-12)
-    distance = np.log((x + floor) / (y + floor))
-    root = np.sqrt(np.square(distance) + 0.05**2)
-    return (root - 0.05).mean(), distance / root / (x + floor) / n
-
-
-def loss_and_gradient(name, x, y):
-    """Return value and gradient of a loss of the package in float32."""
-    leaf = single(x)
-    dr.enable_grad(leaf)
-    value = LOSSES[name](leaf, single(y))
-    dr.backward(value)
-    return float(value[0]), np.array(dr.grad(leaf))
-
-
-def ssim_rounding(x) -> float:
-    """Return the rounding of SSIM's gradient: a window of no contrast cancels terms of |x| / C2."""
-    return 1e-7 * float(np.abs(x).max()) / 0.03**2 / np.size(x)
 
 
 # ---- the loop --------------------------------------------------------------------------------------------

@@ -1,6 +1,5 @@
 """The smooth gain: interpolation between nodes, periodic, bounded, and no finer than it says."""
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -101,25 +100,6 @@ def test_gain_is_bounded_and_only_at_its_bounds(rng):
     free = sum(interpolated(grid, shape, poles(1)) for grid in params.values())
     assert (np.abs(free) > gain.MOST).any() and (np.abs(free) < gain.MOST).any()
     np.testing.assert_allclose(field(g, params, shape), np.clip(free, -12, 12), atol=3e-5)
-
-
-@pytest.mark.parametrize("cycles, share", GAINS)
-@pytest.mark.parametrize("shape", [(5, 8), (17, 33)])
-def test_gradient_is_the_adjoint_of_the_hats(cycles, share, shape, rng):
-    g = gain.GridGain(cycles, share)
-    params = tensors(random(g, rng))
-    for value in params.values():
-        dr.enable_grad(value)
-    weight = rng.standard_normal((shape[0] * shape[1], 3)).astype(np.float32)
-    field = g.evaluate(params, g.prepare(shape))
-    dr.backward(dr.sum(dr.sum(field * mi.Color3f(*(mi.Float(w) for w in weight.T)))))
-    for level, (rows, columns) in enumerate(g.sizes):
-        expected = np.zeros((rows * columns, 3))
-        for node, hat in g.hats(level, shape):
-            np.add.at(expected, node, hat[:, None] * weight)
-        found = np.array(dr.grad(params[f"gain.{level}"])).reshape(-1, 3)
-        np.testing.assert_allclose(found, expected, atol=1e-4)
-        assert np.abs(expected).max() > 0.01
 
 
 def test_finer_grids_start_at_nothing_and_move_as_far_as_they_are_known(rng):

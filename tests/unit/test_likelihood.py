@@ -52,21 +52,6 @@ def test_misfit_is_that_of_the_formula(sigma, painted, mean, rng):
     assert one.robust != painted
 
 
-@pytest.mark.parametrize("painted", [False, True])
-def test_weights_are_those_of_the_first_parts_gradient(painted, rng):
-    """By finite differences; of a residual whose mean of the rest is 0, so that the last part has none."""
-    one = of_stroke()[0] if painted else Likelihood(likelihood.on_average_one(None, FILM))
-    residual, sigma, h = rng.normal(0, 0.1, (*FILM, 3)), 0.1, 1e-5
-    residual -= one.mean(residual) * (one.rest > 0) / max(one.share.sum(), 1e-30) if painted else 0
-    gradient = 2 * one.weights(residual, sigma) * residual
-    for at in ((0, 0, 0), (3, 7, 1), (11, 2, 2), (19, 23, 0)):
-        ends = [residual.copy() for _ in range(2)]
-        ends[0][at] += h
-        ends[1][at] -= h
-        slope = (one.misfit(ends[0], sigma) - one.misfit(ends[1], sigma)) / (2 * h)
-        assert gradient[at] == pytest.approx(slope, rel=1e-4)
-
-
 @pytest.mark.parametrize("change", [0.2, 3.0])
 def test_the_mean_is_scaled_to_have_the_gradient_of_its_loss(change):
     one, coverage = of_stroke()

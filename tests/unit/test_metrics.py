@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from envedit.core.color import inverse_tonemap, tonemap
+from envedit.core.color import LUMINANCE, inverse_tonemap, tonemap
 from envedit.core.errors import ConfigError, InputError
 from envedit.losses import metrics
 from tests.oracles.plain import IDENTICAL
@@ -148,3 +148,19 @@ def test_of_paint_only_pixels_that_count_are_measured(rng):
     assert metrics.painted(edited, wanted, initial, coverage, seen=seen) == pytest.approx(left)
     nothing = metrics.painted(edited, wanted, initial, coverage, seen=np.zeros((4, 6), bool))
     assert nothing == {"towards": None, "elsewhere": None}
+
+
+def high_pass(a):
+    y = np.log(a @ LUMINANCE + 0.01)
+    taps, out = np.array([1, 4, 6, 4, 1]) / 16, np.zeros_like(y)
+    for i in range(5):
+        for j in range(5):
+            rows = np.clip(np.arange(y.shape[0]) + i - 2, 0, y.shape[0] - 1)
+            out += taps[i] * taps[j] * np.roll(y[rows], 2 - j, axis=1)
+    return math.fsum(((y - out) ** 2).ravel()) / y.size
+
+
+@pytest.mark.parametrize("scale", [1e-5, 1.0, 1e5])
+def test_high_frequency_energy_is_what_a_binomial_blur_leaves_out(scale, rng):
+    for image in (scale * rng.random((16, 32, 3)), 10 ** rng.uniform(-5, 5, (16, 32, 3))):
+        assert metrics.high_frequency_energy(image) == pytest.approx(high_pass(image), rel=1e-12)

@@ -1,6 +1,7 @@
-"""Where values come from: presets, precedence, targets and paths."""
+"""Where values come from: presets, precedence, targets and paths; from TOML as from Python."""
 
-import dataclasses
+import itertools
+from dataclasses import fields, replace
 
 import pytest
 
@@ -14,7 +15,7 @@ def test_the_paper_preset_spells_out_every_number_of_the_method():
     free = {"fit": {"cache"}, "representation": {"cycles"}, "loss": set()}
     free["optimizer"] = {"checkpoint_s", "start"}
     for table, left_out in free.items():
-        keys = {f.name for f in dataclasses.fields(getattr(cfg.Config(), table))}
+        keys = {f.name for f in fields(getattr(cfg.Config(), table))}
         assert set(presets.PRESETS["paper"][table]) == keys - left_out, table
 
 
@@ -83,7 +84,7 @@ def test_a_target_is_a_file_or_a_turn_and_the_last_one_given_counts():
     with pytest.raises(ConfigError, match=r"target.file and target.rotate_degrees: got both, expected one"):
         cfg.Target(file="/b.exr", rotate_degrees=5)
     with pytest.raises(ConfigError, match="got both"):
-        dataclasses.replace(cfg.Target(rotate_degrees=5), file="/b.exr")
+        replace(cfg.Target(rotate_degrees=5), file="/b.exr")
     painted = cfg.loads("[target]\nkind = 'image'\nfile = '/b.exr'\nrotate_degrees = 5")
     assert painted.target.file == "/b.exr" and painted.target.rotate_degrees == 5
     (said,) = cfg.unused(painted)
@@ -136,3 +137,69 @@ def test_painted_targets_have_their_own_defaults(kind):
     assert rendered.loss == cfg.loads("").loss
     paper = cfg.loads(f"[target]\n{kind}", preset="paper")
     assert paper.loss.change == 0 and paper.loss.luminance[0] < 1e-4
+
+
+# ---- from Python ------------------------------------------------------------------------------------------
+
+PRESETS = presets.PRESETS
+STROKE = {"type": "shadow", "ellipse": [0.5, 0.5, 0.1, 0.1]}
+TARGETS = {
+    "turned": {},
+    "other map": {"file": "/other.exr"},
+    "image": {"kind": "image", "file": "/painted.png"},
+    "strokes": {"kind": "strokes", "strokes": [STROKE]},
+}
+OUT = {"dir": "/out"}
+
+
+@pytest.mark.parametrize(
+    ("preset", "kind", "target"), [*itertools.product(PRESETS, ("layers", *MANY, ""), TARGETS)]
+)
+def test_tables_from_python_and_from_toml_are_equal(preset, kind, target):
+    """A preset names the kind where none is given."""
+    written = {"representation": {"kind": kind}} if kind else {}
+    given = {"representation": cfg.Representation(kind)} if kind else {}
+    made = cfg.Config(preset=preset, output=cfg.Output(**OUT), target=cfg.Target(**TARGETS[target]), **given)
+    assert made == cfg.from_dict(written | {"preset": preset, "output": OUT, "target": TARGETS[target]})
+    assert made == cfg.loads(cfg.to_toml(made), "/")
+    assert made.representation.kind == (kind or ("siren" if preset == "paper" else "layers"))
+
+
+def test_what_is_given_and_equal_to_the_default_goes_before_the_preset_too():
+    assert cfg.Config(preset="draft", scene=cfg.Scene(width=128)).scene.width == 128
+    assert cfg.Config(preset="draft", scene=cfg.Scene("sphere", 128)).scene.width == 128
+
+
+@pytest.mark.parametrize(("before", "after"), [*itertools.permutations(PRESETS, 2)])
+def test_replacing_the_preset_is_making_it_with_the_other_one(before, after):
+    tables = {
+        "scene": cfg.Scene(parameters={"roughness": 0.3}),
+        "optimizer": cfg.Optimizer(lr=0.5),
+        "seed": 3,
+    }
+    assert replace(cfg.Config(preset=before, **tables), preset=after) == cfg.Config(preset=after, **tables)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_replacing_the_representation_brings_its_defaults_and_keeps_what_was_given(preset):
+    tables = {"optimizer": cfg.Optimizer(iterations=7), "input": cfg.Input(width=64)}
+    other = cfg.Representation("pixels")
+    replaced = replace(cfg.Config(preset=preset, **tables), representation=other)
+    assert replaced == cfg.Config(preset=preset, representation=other, **tables)
+    assert replaced.optimizer.iterations == 7 and replaced.input.width == 64
+    assert replaced.loss.ssim == (1.0 if preset != "paper" else (1.0, 1e4))
+    read = cfg.loads(f'preset = "{preset}"\n[output]\ndir = "/out"\n[optimizer]\niterations = 7\n')
+    replaced = replace(read, representation=cfg.Representation("pixels"))
+    tables = {"optimizer": {"iterations": 7}, "representation": {"kind": "pixels"}}
+    assert replaced == cfg.from_dict({"preset": preset, "output": OUT} | tables)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_replacing_one_key_of_a_table_keeps_all_others(preset):
+    made = cfg.Config(preset=preset, target=cfg.Target(**TARGETS["strokes"]))
+    for name in ("input", "scene", "representation", "fit", "loss", "optimizer", "renderer", "output"):
+        table = getattr(made, name)
+        assert replace(made, **{name: replace(table)}) == made
+    other = replace(made, optimizer=replace(made.optimizer, lr=0.25))
+    assert replace(other, optimizer=made.optimizer) == made and other.optimizer.lr == 0.25
+    assert other.optimizer.iterations == made.optimizer.iterations

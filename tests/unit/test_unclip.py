@@ -13,7 +13,6 @@ from envedit.core.color import linear_to_srgb, luminance
 from envedit.images import images
 from envedit.images.analytic_sky import sunsky
 from envedit.representations.layers import clipped_light, unclip
-from tests.oracles.tiers import slow_but
 
 WIDTH = 512
 OMEGA = latlong.lookup_solid_angles(WIDTH // 2, WIDTH)[:, None, None]
@@ -52,8 +51,8 @@ def of_file(tmp_path, envmap, *options, name="sky.exr"):
     return main.main(["unclip", str(tmp_path / name), "--out", str(tmp_path / "out.exr"), "--json", *options])
 
 
-@pytest.mark.parametrize("azimuth", slow_but([180.0, 0.2], 0.2))
-@pytest.mark.parametrize("clip", slow_but([5.0, 30.0], 5.0))
+@pytest.mark.parametrize("azimuth", [180.0, 0.2])
+@pytest.mark.parametrize("clip", [5.0, 30.0])
 def test_a_clipped_sun_is_found_with_its_flux_across_the_seam_as_well(azimuth, clip):
     image, flux = sun(azimuth, clip=clip)
     light = clipped_light.find(image)

@@ -1,6 +1,6 @@
 """Weight files: every precision, what is missing, and files damaged on purpose."""
 
-import dataclasses
+import collections
 import io
 import pickle
 import struct
@@ -129,27 +129,10 @@ def test_hostile_archives_are_refused(tmp_path):
 
 
 # ---- pickled checkpoints -----------------------------------------------------------------------------------
-@dataclasses.dataclass
-class Global:
-    """What a pickle names, without a need for it."""
-
-    module: str
-    name: str
-
-
-@dataclasses.dataclass
-class Storage:
-    key: str
-    values: np.ndarray
-    count: int | None = None
-
-
-@dataclasses.dataclass
-class Tensor:
-    storage: Storage
-    offset: int
-    shape: tuple
-    strides: tuple
+Global = collections.namedtuple("Global", "module name")
+Storage = collections.namedtuple("Storage", "key values")
+Tensor = collections.namedtuple("Tensor", "storage offset shape strides")
+"""What such a pickle is made of: a name, numbers of a key, and a view of them."""
 
 
 class Torch(pickle._Pickler):
@@ -157,8 +140,7 @@ class Torch(pickle._Pickler):
 
     def persistent_id(self, value):
         if isinstance(value, Storage):
-            count = value.values.size if value.count is None else value.count
-            return "storage", Global("torch", "FloatStorage"), value.key, "cuda:0", count, None
+            return "storage", Global("torch", "FloatStorage"), value.key, "cuda:0", value.values.size, None
         return None
 
     def save(self, value, save_persistent_id=True):

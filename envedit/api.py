@@ -96,6 +96,8 @@ def edit(
         raise ConfigError("mask: got one without a target; expected both: it says where that was painted")
     if target is not None and target_map is not None:
         raise ConfigError("target, target_map: got both, expected one: a picture, or a map to render under")
+    if not isinstance(watch, Watch | None):
+        raise ConfigError(f"watch: got {show(watch)}, expected a Watch")
     named = {"envmap": envmap, "target": target, "mask": mask, "target_map": target_map}
     arrays = {name: _array(name, value) for name, value in named.items() if value is not None}
     of_codes = [_warning_of_codes(name, named[name]) for name in arrays if name != "mask"]

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from envedit import config, inputs
+from envedit.config.validators import Integer, named, show
 from envedit.core import latlong
 from envedit.core.errors import ConfigError, counted
 from envedit.core.extras import required
@@ -184,8 +185,11 @@ class Result:
         Raises
         ------
         ConfigError
-            The edit was not solved by Gauss-Newton steps, or these leave open what the posterior is.
+            The edit was not solved by Gauss-Newton steps, or these leave open what the posterior is; or
+            ``count`` or ``seed`` is no whole number of at least 0.
         """
+        count = named("count", Integer(0, 2**31), count)
+        seed = named("seed", Integer(0, 2**32 - 1), seed)
         if self.found is None or self.posterior is None or self.posterior.sample is None:
             raise ConfigError('Result.samples: needs an edit by layers with optimizer.kind = "gauss-newton"')
         settings = self.settings
@@ -217,11 +221,15 @@ class Result:
 
         Raises
         ------
+        ConfigError
+            ``folder`` is no path.
         InputError
             The folder cannot be used, or a file cannot be written.
         """
         from envedit.report import output_folder, run_folder
 
+        if not isinstance(folder, str | PathLike):
+            raise ConfigError(f"folder: got {show(folder)}, expected a path")
         folder = Path(folder).absolute()
         settings = replace(self.settings, output=replace(self.settings.output, dir=str(folder)))
         warnings = [*self.warnings]

@@ -100,7 +100,6 @@ def from_dict(
     overrides: Iterable[str] = (),
 ) -> Config:
     """Build a configuration from nested dicts with the tables and keys of the TOML file; see `loads`."""
-    file = _checked_layer(table, name)
     assigned: dict[str, Any] = {}
     for text in overrides:
         keys, value = parse_override(text)
@@ -109,6 +108,7 @@ def from_dict(
             layer = {key: layer}
         layer = _checked_layer(layer, f"--set {show(text)}")
         assigned = presets.overlaid(assigned, layer)
+    file = _checked_layer(_not_replaced(table, assigned), name)
 
     chosen = assigned.get("preset", file.get("preset", "standard"))
     if preset is not None:
@@ -122,6 +122,19 @@ def from_dict(
         return Config(**merged, **tables)
     except ConfigError as error:
         raise ConfigError(f"{name}: {error}") from None
+
+
+def _not_replaced(table: Any, assigned: dict[str, Any]) -> Any:
+    """Return what a file gives without the values that overrides replace, which may be unusable."""
+    if not isinstance(table, dict):
+        return table
+    left = {}
+    for key, value in table.items():
+        if key not in assigned:
+            left[key] = value
+        elif isinstance(value, dict) and isinstance(assigned[key], dict):
+            left[key] = _not_replaced(value, assigned[key])
+    return left
 
 
 def _checked_layer(layer: Any, where: str) -> dict[str, Any]:

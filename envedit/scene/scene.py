@@ -26,7 +26,7 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -280,7 +280,8 @@ def load(
 
     # ---- Parse
     width, height = _whole("width", width or 0, 0), _whole("height", height or 0, 0)
-    config, state, path, where, folders = _parsed(file, parameters, base)
+    parsed = _parsed(file, parameters, base)
+    state, where, folders = parsed.state, parsed.where, parsed.folders
 
     # ---- What is read of emitter, integrator and sensors
     own = supported.own_map(state, where, folders, scale)
@@ -296,8 +297,14 @@ def load(
     _change_nodes(state, where, folders)
 
     # ---- Notes, files and digest
-    first = usd.kept(path).notes if path is not None and usd.is_usd(path) else ()
-    notes = (*first, *own.notes, *turned, *integrator.notes, *supported.polarised(state), *sensor_notes)
+    notes = (
+        *parsed.notes,
+        *own.notes,
+        *turned,
+        *integrator.notes,
+        *supported.polarised(state),
+        *sensor_notes,
+    )
     read = [node.props["filename"] for node in state.nodes if "filename" in node.props]
     read += [] if own.file is None else [str(own.file)]
     digest = hashlib.sha256(b"envedit scene 1")
@@ -316,7 +323,7 @@ def load(
     # ---- Build
     # On one thread Mitsuba waits for ever for an EXR texture; libjpeg prints about odd textures.
     with film.threads(max(2, dr.thread_count())), quiet_libraries():
-        scene = parser.instantiated(config, state, where)
+        scene = parser.instantiated(parsed.config, state, where)
     if scene.environment() is None or scene.environment().id() != name:
         raise InputError(f"{where}: a ready-made environment emitter cannot be replaced; give its dict")
     params = mi.traverse(scene)
@@ -329,7 +336,7 @@ def load(
 
     return Scene(
         scene,
-        path,
+        parsed.path,
         columns,
         views[-1].rows.stop,
         key,
@@ -384,12 +391,24 @@ def views_of(scene: mi.Scene, names: Sequence[str]) -> tuple[int, tuple[View, ..
     return sizes[0][0], tuple(views)
 
 
+class _Parsed(NamedTuple):
+    """A scene as Mitsuba's parser has it."""
+
+    config: mi.parser.ParserConfig
+    state: mi.parser.ParserState
+    path: Path | None  # its file; None: a dict
+    where: str  # what errors call it
+    folders: tuple[Path, ...]  # where the files lie that it names
+    notes: tuple[str, ...]  # what of a USD file is not used
+
+
 def _parsed(file, parameters, base):
-    """Parse a scene; returns Mitsuba's configuration and state, the file, its name and where files lie."""
+    """Parse a scene; a USD file becomes a Mitsuba scene first."""
     config = mi.parser.ParserConfig(mi.variant())
     config.merge_meshes = False  # shapes keep their names
     config.unused_parameters = mi.LogLevel.Debug  # checked here, with the nearest name
     base = Path(base or ".").absolute()
+    notes: tuple[str, ...] = ()
     if isinstance(file, dict):
         if parameters:
             raise ConfigError("scene.parameters: a scene given as a dict has no $names to fill")
@@ -401,7 +420,9 @@ def _parsed(file, parameters, base):
         state = parser.called(where, mi.parser.parse_dict, config, file)
     else:
         path = find(file)
-        text = usd.kept(path).xml if usd.is_usd(path) else path
+        text = path
+        if usd.is_usd(path):
+            text, notes = usd.kept(path)[:2]
         filled, outline = _check_parameters(text, parameters or {})
         where, folders = str(path), (text.parent, base, *outline.folders)
         if wrong := scene_files.errors([SceneFile("spectrum", file) for file in outline.spectra]):
@@ -413,7 +434,7 @@ def _parsed(file, parameters, base):
     installed_plugins.come_first()
     for node in state.nodes:
         parser.check_plugin(state, node, where)
-    return config, state, path, where, folders
+    return _Parsed(config, state, path, where, folders, notes)
 
 
 def relit(
@@ -431,7 +452,8 @@ def relit(
     emitter becomes an ``envmap`` of the file ``envmap``, as it shall stand in the XML, with the rotation and
     ``scale`` of :func:`load`, or one is added; a scene without an integrator gets ``path``.
     """
-    _, state, _, where, folders = _parsed(file, parameters, base)
+    parsed = _parsed(file, parameters, base)
+    state, where, folders = parsed.state, parsed.where, parsed.folders
     own = supported.own_map(state, where, folders, scale)
     emitter, _, _ = parser.replace_environment(state, where, up)
     _change_nodes(state, where, folders)

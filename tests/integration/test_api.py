@@ -171,6 +171,7 @@ def test_a_built_scene_that_cannot_be_used_is_refused():
     [
         (lambda: {"settings": 3}, ConfigError, ["settings: got 3, expected a Config, a dict of tables"]),
         (lambda: {"settings": {"scene": {"fil": "a"}}}, ConfigError, ["no key fil", "did you mean file?"]),
+        (lambda: {"watch": 3}, ConfigError, ["watch: got 3, expected a Watch"]),
         (lambda: {"mask": np.ones((4, 4))}, ConfigError, ["mask: got one without a target"]),
         (lambda: {"target": np.ones(3), "target_map": np.ones(3)}, ConfigError, ["got both, expected one"]),
         (lambda: {"envmap": "sky.exr"}, InputError, ["envmap: got 'sky.exr', expected an array"]),
@@ -223,6 +224,9 @@ def test_codes_of_a_picture_as_radiance_are_warned_of():
         (lambda: envedit.load_map("none.exr", width=64.0), "must be even, from 6 to 32768, got 64.0"),
         (lambda: envedit.load_map("none.exr", width="64"), "must be even, from 6 to 32768, got '64'"),
         (lambda: envedit.fit(np.ones((8, 16, 3)), seed=-1), "seed: got -1, expected an integer"),
+        (lambda: envedit.Result.save(object(), None), "folder: got None, expected a path"),
+        (lambda: envedit.Result.samples(object(), 1.5), "count: got 1.5, expected an integer"),
+        (lambda: envedit.Result.samples(object(), 1, seed=-1), "seed: got -1, expected an integer"),
         (lambda: envedit.sunsky(63), "input.width: got 63, expected an even integer"),
         (lambda: envedit.LightTransport.build("sphere", spp="many"), "renderer.spp: got 'many', expected"),
         (lambda: envedit.LightTransport.build(3), "scene: got int, expected a file, a dict"),
@@ -273,8 +277,9 @@ def test_importing_envedit_limits_the_threads_of_numpy_but_not_against_the_user(
     subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT, env=rest | given)
 
 
-def test_importing_envedit_imports_no_mitsuba():
-    code = "import sys, envedit; dir(envedit); assert 'mitsuba' not in sys.modules; envedit.Config()"
+@pytest.mark.parametrize("first", ["dir(envedit)", "import envedit.cli.fit"])
+def test_mitsuba_is_not_imported_before_it_is_used_where_ctrl_c_may_come(first):
+    code = f"import sys, envedit; {first}; assert 'mitsuba' not in sys.modules; envedit.Config()"
     subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)
 
 

@@ -528,6 +528,17 @@ def test_references_that_multiply(tmp_path):
 # ---- Files -------------------------------------------------------------------------------------------------
 
 
+def test_a_load_looks_for_the_converted_scene_once(tmp_path, monkeypatch):
+    stage = new_stage(tmp_path)
+    add_camera(stage)
+    add_square(stage)
+    asked = []
+    kept = conversion.kept
+    monkeypatch.setattr(conversion, "kept", lambda file: asked.append(file) or kept(file))
+    notes = scene.load(saved(stage), 8).notes
+    assert len(asked) == 1 and "shot.usda: no light in the stage: give a map (/)" in notes
+
+
 @pytest.mark.slow
 def test_a_scene_is_made_anew_when_a_layer_changes(tmp_path):
     below = new_stage(tmp_path, name="below.usda")

@@ -340,6 +340,13 @@ def test_strokes_and_the_kind_of_target_go_together():
     assert "--set" in refused("", "target.strokes=[{type = 'blur'}]")
 
 
+def test_an_override_replaces_strokes_of_the_file_that_are_refused():
+    text = "[target]\nkind = 'strokes'\nstrokes = [{type = 'blurr'}]"
+    found = cfg.loads(text, overrides=["target.strokes=[{type = 'contrast'}]"])
+    assert found.target.strokes[0]["type"] == "contrast"
+    assert "target.strokes[0].type" in refused(text, "target.kind=strokes")
+
+
 def test_strokes_come_back_from_toml_equal_and_paint_the_same(rng):
     config = cfg.from_dict({"target": {"kind": "strokes", "strokes": ALL, "tonemap": "srgb"}})
     again = cfg.loads(cfg.to_toml(config), base_dir="/elsewhere", name="other.toml")

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from envedit.config.validators import Check, Choice, Number, Numbers, Points, Schema, Tables
+from envedit.config.validators import Check, Choice, Number, Numbers, Points, Tables
 from envedit.core.errors import ConfigError
 
 MOST_REGIONS, MOST_POINTS = 64, 500
@@ -46,23 +46,21 @@ class RegionList(Tables):
 
     name = "input.regions"
     most = MOST_REGIONS
+    keys = KEYS
+    rules = {
+        "required": ["action"],
+        "oneOf": [{"required": ["points"]}, {"required": ["polygon"]}],
+        "dependencies": {"points": ["radius"], "radius": ["points"]},
+    }
 
     def _entry(self, name: str, region: dict[str, Any]) -> dict[str, Any]:
-        found = self._checked(name, region, {key: check for key, (check, _) in KEYS.items()})
+        found = self._checked(name, region)
         if "action" not in found:
             raise ConfigError(f"{name}.action: got none, expected one of {', '.join(ACTIONS)}")
         if ("points" in found) == ("polygon" in found):
             given = "both" if "points" in found else "neither"
             raise ConfigError(f"{name}: got {given} of points and polygon, expected one of them")
         self._require(name, "radius", found, needed="points" in found, where="with points")
-        self._require(
-            name, "factor", found, needed=found["action"] == "scale", where='where action is "scale"'
-        )
+        scales = found["action"] == "scale"
+        self._require(name, "factor", found, needed=scales, where='where action is "scale"')
         return {"softness": 0.0} | found
-
-    def schema(self) -> Schema:
-        keys = {key: {**check.schema(), "description": meaning} for key, (check, meaning) in KEYS.items()}
-        shape = [{"required": ["points"]}, {"required": ["polygon"]}]
-        brush = {"points": ["radius"], "radius": ["points"]}
-        region = {"properties": keys, "required": ["action"], "oneOf": shape, "dependencies": brush}
-        return self._schema_of(region)

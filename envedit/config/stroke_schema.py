@@ -16,6 +16,7 @@ from envedit.config.validators import (
     VIEW,
     Check,
     Choice,
+    Either,
     Number,
     Numbers,
     Points,
@@ -85,68 +86,82 @@ class Rectangle(Check):
         return _CORNERS.schema()
 
 
-SHAPES: dict[str, Check] = {
-    "points": Points(_POINT, "x, y", 1),
-    "polygon": Points(_POINT, "x, y", 3),
-    "ellipse": Ellipse(),
-    "rectangle": Rectangle(),
-}
-"""Where a stroke is."""
-
-STROKES: dict[str, dict[str, tuple[Any, Check]]] = {
-    "shadow": {"amount": (0.6, Number(0, 1)), "color": ([1.0, 1.0, 1.0], Color())},
-    "light": {"amount": (0.5, Number(0, 1e6)), "color": ([1.0, 1.0, 1.0], Color())},
-    "erase-shadow": {},
-    "temperature": {"kelvin": (None, Number(2000, 25000))},
-    "contrast": {"amount": (1.5, Number(0, 100))},
-    "blur": {"radius": (None, _LENGTH)},
-    "hold": {},
-}
-"""What a stroke does, and the keys that belong to it: default (None: it must be given) and check."""
-
+SHAPES = ("points", "polygon", "ellipse", "rectangle")
+"""Keys that say where a stroke is."""
 WHOLE_IMAGE = ("temperature", "contrast", "blur")
 """What may be done to the whole image, without a shape."""
-
-ANY_STROKE: dict[str, tuple[Any, Check]] = {
-    "units": ("fraction", Choice("fraction", "pixels")),
-    "softness": (0.0, Number(0, _FURTHEST)),
-    "opacity": (1.0, Number(0, 1)),
+STROKES: dict[str, dict[str, Any]] = {
+    "shadow": {"amount": 0.6, "color": [1.0, 1.0, 1.0]},
+    "light": {"amount": 0.5, "color": [1.0, 1.0, 1.0]},
+    "erase-shadow": {},
+    "temperature": {"kelvin": None},
+    "contrast": {"amount": 1.5},
+    "blur": {"radius": None},
+    "hold": {},
 }
+"""What a stroke does, and the keys that belong to it with their defaults; None: it must be given."""
+ANY_STROKE = {"units": "fraction", "softness": 0.0, "opacity": 1.0}
 """Keys of every stroke, likewise."""
+_AMOUNTS = {"shadow": Number(0, 1), "light": Number(0, 1e6), "contrast": Number(0, 100)}
 
-MEANINGS = {
-    "type": "what it does to the rendering",
-    "points": "middle line of a brush: [x, y], to the right and downwards from the upper left corner",
-    "width": "of the brush; only with points, and needed there",
-    "polygon": "corners of a region",
-    "ellipse": "[cx, cy, rx, ry] or [cx, cy, rx, ry, degrees]: centre, radii and turn of a region",
-    "rectangle": "[x0, y0, x1, y1]: corners of a region",
-    "view": "view that it is painted on: index or id",
-    "amount": "shadow: share of the light taken; light: radiance added; contrast: factor",
-    "color": 'factors on linear radiance, or a display colour, "#rrggbb"',
-    "kelvin": "temperature: of the light in place of 6500 K",
-    "radius": "blur: standard deviation of the Gaussian",
-    "units": "of all lengths: shares of the picture's width and height, or pixels",
-    "softness": "width over which the border fades",
-    "opacity": "share of the change that is painted",
+KEYS: dict[str, tuple[Check, str]] = {
+    "type": (Choice(*STROKES), "what it does to the rendering"),
+    "points": (
+        Points(_POINT, "x, y", 1),
+        "middle line of a brush: [x, y], to the right and downwards from the upper left corner",
+    ),
+    "polygon": (Points(_POINT, "x, y", 3), "corners of a region"),
+    "ellipse": (
+        Ellipse(),
+        "[cx, cy, rx, ry] or [cx, cy, rx, ry, degrees]: centre, radii and turn of a region",
+    ),
+    "rectangle": (Rectangle(), "[x0, y0, x1, y1]: corners of a region"),
+    "width": (_LENGTH, "of the brush; only with points, and needed there"),
+    "view": (VIEW, "view that it is painted on: index or id"),
+    "amount": (
+        Either("a number of at least 0", *_AMOUNTS.values()),
+        "shadow: share of the light taken; light: radiance added; contrast: factor",
+    ),
+    "color": (Color(), 'factors on linear radiance, or a display colour, "#rrggbb"'),
+    "kelvin": (Number(2000, 25000), "temperature: of the light in place of 6500 K"),
+    "radius": (_LENGTH, "blur: standard deviation of the Gaussian"),
+    "units": (
+        Choice("fraction", "pixels"),
+        "of all lengths: shares of the picture's width and height, or pixels",
+    ),
+    "softness": (Number(0, _FURTHEST), "width over which the border fades"),
+    "opacity": (Number(0, 1), "share of the change that is painted"),
 }
-"""What each key is, for the reference."""
+"""Of a stroke: check and meaning of each key."""
+
+
+def _with_defaults() -> dict[str, tuple[Check, str]]:
+    """Return the keys, their meaning with the defaults that each type has."""
+    defaults: dict[str, list[str]] = {}
+    for kind, keys in (*STROKES.items(), ("every type", ANY_STROKE)):
+        for key, default in keys.items():
+            value = "needed" if default is None else json.dumps(default)
+            defaults.setdefault(key, []).append(f"{kind}: {value}")
+    more = {key: f" (default of {', '.join(each)})" for key, each in defaults.items()}
+    return {key: (check, about + more.get(key, "")) for key, (check, about) in KEYS.items()}
 
 
 class StrokeList(Tables):
     """A list of strokes, each with all of its keys spelled out; see :mod:`envedit.targets.strokes`."""
 
     name = "target.strokes"
+    keys = _with_defaults()
+    rules = {"required": ["type"]}
 
     def _entry(self, name: str, stroke: dict[str, Any]) -> dict[str, Any]:
         if "type" not in stroke:
             raise ConfigError(f"{name}.type: got none, expected one of {', '.join(STROKES)}")
         kind = named(f"{name}.type", Choice(*STROKES), stroke["type"])
         own = STROKES[kind] | ANY_STROKE
-        checks = {key: check for key, (_, check) in own.items()}
-        checks = {"type": Choice(kind), **SHAPES, "width": _LENGTH, "view": VIEW, **checks}
-        defaults = {key: default for key, (default, _) in own.items() if default is not None}
-        found = self._checked(name, defaults | stroke, checks)
+        of_types = {key for keys in STROKES.values() for key in keys}
+        others = dict.fromkeys(of_types - own.keys()) | {"amount": _AMOUNTS.get(kind)}
+        defaults = {key: default for key, default in own.items() if default is not None}
+        found = self._checked(name, defaults | stroke, **others)
 
         # ---- One shape, and what it and the type need
         shapes = [shape for shape in SHAPES if shape in found]
@@ -158,21 +173,3 @@ class StrokeList(Tables):
         for key in own.keys() - found.keys():
             raise ConfigError(f"{name}.{key}: got none, expected a number, as type is {kind}")
         return found
-
-    def schema(self) -> Schema:
-        checks: dict[str, list[Check]] = {"type": [Choice(*STROKES)], **{k: [c] for k, c in SHAPES.items()}}
-        checks |= {"width": [_LENGTH], "view": [VIEW]}
-        defaults: dict[str, list[str]] = {}
-        for kind, keys in (*STROKES.items(), ("every type", ANY_STROKE)):
-            for key, (default, check) in keys.items():
-                checks.setdefault(key, []).append(check)
-                value = "needed" if default is None else json.dumps(default)
-                defaults.setdefault(key, []).append(f"{kind}: {value}")
-
-        properties: Schema = {}
-        for key, options in checks.items():
-            each = [check.schema() for check in dict.fromkeys(options)]
-            default = f" (default of {', '.join(defaults[key])})" if key in defaults else ""
-            about = {"description": MEANINGS[key] + default}
-            properties[key] = (each[0] if len(each) == 1 else {"anyOf": each}) | about
-        return self._schema_of({"properties": properties, "required": ["type"]})

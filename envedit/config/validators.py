@@ -64,6 +64,8 @@ class Tables(Check):
     words = "a list of tables"
     name: str  # of the key, "input.lights"
     most: int | None = None  # entries; None: any number
+    keys: dict[str, tuple[Check, str]]  # of an entry: check and meaning
+    rules: Schema  # what depends on several keys of an entry, as JSON Schema
 
     def __call__(self, value: Any) -> tuple[dict[str, Any], ...]:
         if not isinstance(value, list | tuple) or not all(isinstance(v, dict) for v in value):
@@ -75,11 +77,17 @@ class Tables(Check):
     @abstractmethod
     def _entry(self, name: str, table: dict[str, Any]) -> dict[str, Any]: ...
 
-    def _checked(self, name: str, table: dict[str, Any], keys: dict[str, Check]) -> dict[str, Any]:
-        """Return the values of an entry, in the order of the keys that it may have."""
-        for unknown in (key for key in table if key not in keys):
-            raise ConfigError(f"{name}: has no key {show(unknown)}; {meant(unknown, keys)}")
-        return {key: named(f"{name}.{key}", check, table[key]) for key, check in keys.items() if key in table}
+    def _checked(self, name: str, table: dict[str, Any], **others: Check | None) -> dict[str, Any]:
+        """Return the values of an entry, in the order of :attr:`keys`.
+
+        ``others`` are checks in place of those of the keys; None: the entry cannot have the key.
+        """
+        checks = {key: others.get(key, check) for key, (check, _) in self.keys.items()}
+        known = {key: check for key, check in checks.items() if check}
+        for key in table:
+            if key not in known:
+                raise ConfigError(f"{name}: has no key {show(key)}; {meant(key, known)}")
+        return {k: named(f"{name}.{k}", check, table[k]) for k, check in known.items() if k in table}
 
     def _require(self, name: str, key: str, found: dict[str, Any], needed: bool, where: str) -> None:
         """Raise ConfigError where a key of an entry is missing, or is given without a meaning."""
@@ -88,9 +96,9 @@ class Tables(Check):
         if not needed and key in found:
             raise ConfigError(f"{name}.{key}: got {show(found[key])}, expected none but {where}")
 
-    def _schema_of(self, table: Schema) -> Schema:
-        """Return that of the list, given what entries have beside being tables of these properties."""
-        entry = {"type": "object", **table, "additionalProperties": False}
+    def schema(self) -> Schema:
+        keys = {key: {**check.schema(), "description": about} for key, (check, about) in self.keys.items()}
+        entry = {"type": "object", "properties": keys, **self.rules, "additionalProperties": False}
         return {"type": "array", "items": entry} | ({} if self.most is None else {"maxItems": self.most})
 
 

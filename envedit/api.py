@@ -100,7 +100,6 @@ def edit(
         raise ConfigError(f"watch: got {show(watch)}, expected a Watch")
     named = {"envmap": envmap, "target": target, "mask": mask, "target_map": target_map}
     arrays = {name: _array(name, value) for name, value in named.items() if value is not None}
-    of_codes = [_warning_of_codes(name, named[name]) for name in arrays if name != "mask"]
     chosen, folder = _settings(settings)
     base = base or folder
     mi.set_variant(chosen.variant)
@@ -113,16 +112,10 @@ def edit(
                 stack.enter_context(built_scene.kept(scene))
             loaded = built_scene.load(scene, chosen.scene, base)
             chosen = _of_scene(chosen, loaded)
-        memory = inputs.Given(
-            scene=loaded,
-            envmap=arrays.get("envmap"),
-            target_map=arrays.get("target_map"),
-            picture=arrays.get("target"),
-            mask=arrays.get("mask"),
-        )
+        memory = inputs.Given(loaded, **arrays)
         result = run(_of_arrays(chosen, arrays), base=base, watch=watch, memory=memory)
-    if any(of_codes):
-        result.warnings[:0] = filter(None, of_codes)
+    of_codes = [_warning_of_codes(name, named[name]) for name in arrays if name != "mask"]
+    result.warnings[:0] = filter(None, of_codes)
     return result
 
 

@@ -195,7 +195,7 @@ class _Edit:
                 settings,
                 self.scene,
                 self.original,
-                picture=self.memory.picture,
+                picture=self.memory.target,
                 mask=self.memory.mask,
                 other=self.memory.target_map,
             )
@@ -253,14 +253,12 @@ class _Edit:
         preparation = Preparation(
             self.settings,
             self.small,
-            self.original,
+            self.map,
             self.rows,
             self.folder,
             self.watch,
             self.dists,
             self.clock,
-            self.map.locked,
-            self.map.kept,
         )
         preparation.trace()
         return preparation

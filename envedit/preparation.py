@@ -23,6 +23,7 @@ from envedit.core.rows import Rows
 from envedit.core.seeds import Seeds
 from envedit.core.types import Params
 from envedit.images import map_regions
+from envedit.inputs import InputMap
 from envedit.losses.perceptual import distances
 from envedit.representations.layers import below_horizon
 from envedit.representations.siren.siren import Siren
@@ -72,17 +73,19 @@ class Preparation:
 
     settings: config.Config  # what is to be done
     scene: Scene  # what is lit
-    original: np.ndarray  # (H, W, 3), the map
+    map: InputMap  # what is edited; where it is locked or kept, the sky is not turned
     rows: Rows  # its active rows
     folder: Path | None  # of the checkpoint
     watch: Watch  # receives progress
     dists: distances.Dists | None  # as for :class:`.edit_state.EditState`
     clock: Callable[[str], AbstractContextManager]  # ``with clock(name):`` adds up seconds
-    # (H, W, 3), radiance of lights that layers leave as they are; the sky is then not turned
-    locked: np.ndarray | None = None
-    kept: np.ndarray | None = None  # (H, W), how far texels stay as they are; the sky is then not turned
     renderer: renderers.Renderer | None = None  # once :meth:`trace` has made it
     _recordings: initialization.Recordings | None = None
+
+    @property
+    def original(self) -> np.ndarray:
+        """The map's radiance, (H, W, 3)."""
+        return self.map.radiance
 
     def trace(self) -> None:
         """Trace the light transport, or prepare the path tracer."""
@@ -152,7 +155,7 @@ class Preparation:
         chosen, transport = self.settings.representation.turn, self.renderer.transport
         if chosen is False or transport is None or not self.rows.all:
             return None
-        if self.locked is not None or self.kept is not None:
+        if self.map.locked is not None or self.map.kept is not None:
             return None
         if chosen == "auto" and target.coverage is not None:  # most of a painted picture is to stay
             return None
@@ -251,8 +254,8 @@ class Preparation:
         frozen = self._frozen(determined=bool(octaves) or not job.newton)
         if frozen is not None and frozen.any():
             job.free = ~frozen[rows]
-        if self.kept is not None and kind != "layers":  # which know it themselves
-            open_texels = self.kept[rows] < map_regions.KEPT_SHARE
+        if self.map.kept is not None and kind != "layers":  # which know it themselves
+            open_texels = self.map.kept[rows] < map_regions.KEPT_SHARE
             job.free = open_texels if job.free is None else job.free & open_texels
 
         # ---- How bright the sky of a network begins
@@ -321,8 +324,8 @@ class Preparation:
             lambda done, total, loss: self.watch.progress(done, total, f"loss {loss:.4g}"),
             self.rows.place,
             horizon,
-            None if self.locked is None else self.locked[self.rows.slice],
-            None if self.kept is None else self.kept[self.rows.slice],
+            None if self.map.locked is None else self.map.locked[self.rows.slice],
+            None if self.map.kept is None else self.map.kept[self.rows.slice],
         )
 
     def _explained(self, layers, octaves, notes, transport):

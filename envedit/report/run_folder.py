@@ -87,8 +87,7 @@ def write_given(
             "edited.xml is not written"
         )
         settings = replace(settings, output=replace(settings.output, scene=False))
-    arrays = {"envmap": memory.envmap, "target_map": memory.target_map}
-    arrays |= {"target": memory.picture, "mask": memory.mask}
+    arrays = {name: getattr(memory, name) for name in ("envmap", "target_map", "target", "mask")}
     files = {name: folder / f"given_{name}.exr" for name, array in arrays.items() if array is not None}
     for name, file in files.items():
         array = np.asarray(arrays[name], np.float32)

@@ -135,9 +135,7 @@ def wrapped(scene: Any, sensors: str | Sequence[int | str] = "all") -> Scene:
         params=params,
         views=views,
         own=OwnMap(None, scale),
-        max_depth=integrator.max_depth,
-        rr_depth=integrator.rr_depth,
-        hide_emitters=integrator.hide_emitters,
+        integrator=integrator,
         notes=integrator.notes,
     )
 

@@ -88,10 +88,9 @@ def values(schema: Schema) -> str:
             return "; or ".join(map(values, options))
         case {"enum": names}:
             return ", ".join(f'"{name}"' for name in names)
-        case {"type": "array", "items": [*items], "minItems": least}:
-            count = len(items) if least == len(items) else f"{least} to {len(items)}"
+        case {"type": "array", "items": [*items]}:
             each = {values(item) for item in items}
-            return f"list of {count}: {each.pop()}" if len(each) == 1 else f"list of {count} numbers"
+            return f"list of {len(items)}" + (f": {each.pop()}" if len(each) == 1 else " numbers")
         case {"type": "array", "items": item}:
             inner = f"({values(item)})" if "anyOf" in item or "items" in item else values(item)
             inner += "s" * inner.isalpha()

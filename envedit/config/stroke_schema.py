@@ -32,7 +32,12 @@ _FURTHEST = 1e6
 _COORDINATE = Number(-_FURTHEST, _FURTHEST)
 _LENGTH = Number(0, _FURTHEST, positive=True)
 _POINT = Numbers(_COORDINATE, _COORDINATE)
-_ELLIPSE = _COORDINATE, _COORDINATE, _LENGTH, _LENGTH, Number(-360, 360)
+_RADII = _LENGTH, _LENGTH
+_ELLIPSE = Either(
+    "[cx, cy, rx, ry] or [cx, cy, rx, ry, degrees]",
+    Numbers(*_POINT.checks, *_RADII),
+    Numbers(*_POINT.checks, *_RADII, Number(-360, 360)),
+)
 _CORNERS = Numbers(*4 * [_COORDINATE])
 _LINEAR = Numbers(*3 * [Number(0, 1e6)])
 
@@ -53,20 +58,6 @@ class Color(Check):
 
     def schema(self) -> Schema:
         return {"anyOf": [_LINEAR.schema(), {"type": "string", "pattern": "^#[0-9a-fA-F]{6}$"}]}
-
-
-class Ellipse(Check):
-    """Centre, radii and, if it is turned, degrees."""
-
-    words = "[cx, cy, rx, ry] or [cx, cy, rx, ry, degrees]"
-
-    def __call__(self, value: Any) -> list[float]:
-        if not isinstance(value, list | tuple) or len(value) not in (4, 5):
-            raise WantedError(str(self))
-        return Numbers(*_ELLIPSE[: len(value)])(value)
-
-    def schema(self) -> Schema:
-        return Numbers(*_ELLIPSE).schema() | {"minItems": 4}
 
 
 class Rectangle(Check):
@@ -112,7 +103,7 @@ KEYS: dict[str, tuple[Check, str]] = {
     ),
     "polygon": (Points(_POINT, "x, y", 3), "corners of a region"),
     "ellipse": (
-        Ellipse(),
+        _ELLIPSE,
         "[cx, cy, rx, ry] or [cx, cy, rx, ry, degrees]: centre, radii and turn of a region",
     ),
     "rectangle": (Rectangle(), "[x0, y0, x1, y1]: corners of a region"),

@@ -378,22 +378,12 @@ class Parameters(Check):
     """A flat table of strings, numbers and booleans."""
 
     words = "a table of strings, numbers and booleans"
+    scalar = Either(words, Boolean(), String(), Integer(-(2**63), 2**63 - 1), Number(-math.inf))
 
     def __call__(self, value: Any) -> dict[str, str | float | bool]:
         if not isinstance(value, dict):
-            raise WantedError(str(self))
-        return {String()(name): self._scalar(scalar) for name, scalar in value.items()}
-
-    def _scalar(self, value: Any) -> str | float | bool:
-        if isinstance(value, bool):
-            return value
-        if isinstance(value, str):
-            return String()(value)
-        if isinstance(value, Integral):
-            return Integer(-(2**63), 2**63 - 1)(value)
-        if isinstance(value, Real):
-            return Number(-math.inf)(value)
-        raise WantedError(str(self))
+            raise WantedError(self.words)
+        return {String()(name): self.scalar(scalar) for name, scalar in value.items()}
 
     def schema(self) -> Schema:
         return {"type": "object", "additionalProperties": {"type": ["string", "number", "boolean"]}}

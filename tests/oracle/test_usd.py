@@ -537,6 +537,9 @@ def test_a_load_looks_for_the_converted_scene_once(tmp_path, monkeypatch):
     monkeypatch.setattr(conversion, "kept", lambda file: asked.append(file) or kept(file))
     notes = scene.load(saved(stage), 8).notes
     assert len(asked) == 1 and "shot.usda: no light in the stage: give a map (/)" in notes
+    (tmp_path / "file").touch()  # where no cache can be kept, the scene is made for this process
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    assert scene.load(saved(stage), 8).notes == notes
 
 
 @pytest.mark.slow

@@ -54,54 +54,6 @@ class Check(ABC):
         return self.words
 
 
-class Tables(Check):
-    """A list of tables.
-
-    Calling it raises ConfigError, which names ``input.lights[2].flux``, where an entry has an unknown key or
-    an unusable value; WantedError if it is no list of tables, or too long.
-    """
-
-    words = "a list of tables"
-    name: str  # of the key, "input.lights"
-    most: int | None = None  # entries; None: any number
-    keys: dict[str, tuple[Check, str]]  # of an entry: check and meaning
-    rules: Schema  # what depends on several keys of an entry, as JSON Schema
-
-    def __call__(self, value: Any) -> tuple[dict[str, Any], ...]:
-        if not isinstance(value, list | tuple) or not all(isinstance(v, dict) for v in value):
-            raise WantedError(str(self))
-        if self.most is not None and len(value) > self.most:
-            raise WantedError(f"at most {self.most} {self.name.split('.')[1]}")
-        return tuple(self._entry(f"{self.name}[{i}]", v) for i, v in enumerate(value))
-
-    @abstractmethod
-    def _entry(self, name: str, table: dict[str, Any]) -> dict[str, Any]: ...
-
-    def _checked(self, name: str, table: dict[str, Any], **others: Check | None) -> dict[str, Any]:
-        """Return the values of an entry, in the order of :attr:`keys`.
-
-        ``others`` are checks in place of those of the keys; None: the entry cannot have the key.
-        """
-        checks = {key: others.get(key, check) for key, (check, _) in self.keys.items()}
-        known = {key: check for key, check in checks.items() if check}
-        for key in table:
-            if key not in known:
-                raise ConfigError(f"{name}: has no key {show(key)}; {meant(key, known)}")
-        return {k: named(f"{name}.{k}", check, table[k]) for k, check in known.items() if k in table}
-
-    def _require(self, name: str, key: str, found: dict[str, Any], needed: bool, where: str) -> None:
-        """Raise ConfigError where a key of an entry is missing, or is given without a meaning."""
-        if needed and key not in found:
-            raise ConfigError(f"{name}.{key}: got none, expected one {where}")
-        if not needed and key in found:
-            raise ConfigError(f"{name}.{key}: got {show(found[key])}, expected none but {where}")
-
-    def schema(self) -> Schema:
-        keys = {key: {**check.schema(), "description": about} for key, (check, about) in self.keys.items()}
-        entry = {"type": "object", "properties": keys, **self.rules, "additionalProperties": False}
-        return {"type": "array", "items": entry} | ({} if self.most is None else {"maxItems": self.most})
-
-
 # ---- words -------------------------------------------------------------------------------------------------
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from envedit import config as cfg
-from envedit.config.stroke_schema import STROKES, StrokeList
+from envedit.config.list_schema import STROKES, StrokeList
 from envedit.core.color import TONEMAPS, inverse_tonemap, luminance, tonemap
 from envedit.targets import stroke_shapes, strokes
 from tests.oracles import ROOT

@@ -112,8 +112,8 @@ def edit(
                 stack.enter_context(built_scene.kept(scene))
             loaded = built_scene.load(scene, chosen.scene, base)
             chosen = _of_scene(chosen, loaded)
-        memory = inputs.Given(loaded, **arrays)
-        result = run(_of_arrays(chosen, arrays), base=base, watch=watch, memory=memory)
+        given = inputs.Replacements(loaded, **arrays)
+        result = run(_of_arrays(chosen, arrays), base=base, watch=watch, replacements=given)
     of_codes = [_warning_of_codes(name, named[name]) for name in arrays if name != "mask"]
     result.warnings[:0] = filter(None, of_codes)
     return result

@@ -28,7 +28,7 @@ _ROUNDING = 1e-6  # of a texel's largest channel
 
 
 @dataclass(frozen=True)
-class Given:
+class Replacements:
     """Arrays and objects that take the place of a configuration's files."""
 
     scene: Scene | None = None
@@ -38,6 +38,10 @@ class Given:
     target: np.ndarray | None = None  # (h, w, 3), a painted picture, linear radiance
     # (h, w), where it was painted, in [0, 1]; None: where it differs from the initial rendering
     mask: np.ndarray | None = None
+
+
+NO_REPLACEMENTS = Replacements()
+"""Everything is read from the configuration's files."""
 
 
 @dataclass(frozen=True)

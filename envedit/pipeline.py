@@ -62,19 +62,19 @@ def run(
     resume: bool = False,
     base: Path | None = None,
     watch: Watch | None = None,
-    memory: inputs.Given | None = None,
+    replacements: inputs.Replacements = inputs.NO_REPLACEMENTS,
 ) -> Result:
     """Carry out an edit.
 
     Checkpoints are written to ``folder`` while the loop runs; None: nowhere. With ``resume`` the run
     continues from the checkpoint that is there, if there is one. ``base`` and ``watch`` are as of
-    :func:`.api.edit`; ``memory`` has arrays and a scene in place of the configuration's files.
+    :func:`.api.edit`; ``replacements`` has arrays and a scene in place of the configuration's files.
 
     EnveditError has the exit code of its cause. Interrupted is raised after Ctrl-C during the edit; the
     checkpoint, where there is one, is of the last step that was kept. Stopped if the optimisation cannot go
     on.
     """
-    edit = _Edit(settings, folder, base, watch or Watch(), memory or inputs.Given())
+    edit = _Edit(settings, folder, base, watch or Watch(), replacements)
     try:
         edit.load()
         if edit.to_solve:
@@ -148,7 +148,7 @@ class _Edit:
     degrees = 0.0
     level = 1.0
 
-    def __init__(self, settings, folder, base, watch, memory):
+    def __init__(self, settings, folder, base, watch, replacements):
         self.begun = time.perf_counter()
         self.clock = _Clock()
         networks = installed.load(settings)
@@ -158,7 +158,7 @@ class _Edit:
         self.folder = folder
         self.base = base
         self.watch = watch
-        self.memory = memory
+        self.replacements = replacements
         self.seeds = Seeds(settings.seed)
         self.notes: list[str] = []
         self.warnings: list[str] = []
@@ -174,8 +174,9 @@ class _Edit:
         settings = self.settings
         with self.clock("target_s"):
             self.watch.stage("loading")
-            self.scene = self.small = self.memory.scene or inputs.load_scene(settings.scene, self.base)
-            self.map = inputs.read_map(settings.input, self.scene, settings.input.width, self.memory.envmap)
+            array = self.replacements.envmap
+            self.scene = self.small = self.replacements.scene or inputs.load_scene(settings.scene, self.base)
+            self.map = inputs.read_map(settings.input, self.scene, settings.input.width, array)
             self.original = self.map.radiance
             self.rows = inputs.active_rows(settings.input.rows, len(self.original))
             self.warnings += self.map.warnings
@@ -191,14 +192,7 @@ class _Edit:
             self.small = working_size.smaller(settings, self.scene)
             renderers.check(settings, self.small, self.original.shape[:2])
             self.watch.stage("rendering the target")
-            self.target = make_target(
-                settings,
-                self.scene,
-                self.original,
-                picture=self.memory.target,
-                mask=self.memory.mask,
-                other=self.memory.target_map,
-            )
+            self.target = make_target(settings, self.scene, self.original, self.replacements)
             self.warnings += self.target.warnings
 
     @property
@@ -305,7 +299,7 @@ class _Edit:
 
         Where these leave float32, it is cut at what the file could have been read with.
         """
-        stop.given = self.map
+        stop.input_map = self.map
         try:
             stop.envmap = self.map.as_stored(stop.envmap, self.degrees)
         except NumericalError:
@@ -608,7 +602,7 @@ class _Edit:
             frozen=self.frozen,
             scene=self.scene.path,
             reach=self.feasible,
-            given=self.map,
+            input_map=self.map,
             alpha=self.scene.alpha,
             found=found,
             posterior=self.start.layers.posterior if job else None,
@@ -616,6 +610,6 @@ class _Edit:
             outliers=self.outliers,
             variants=self.others,
             settings=self.settings,
-            memory=self.memory,
+            replacements=self.replacements,
             base=self.base,
         )

@@ -85,14 +85,14 @@ class Result:
     frozen: np.ndarray | None = None
     scene: Path | None = None  # its file
     reach: Reach | None = None
-    given: inputs.InputMap | None = None  # the map that was edited
+    input_map: inputs.InputMap | None = None  # the map that was edited
     alpha: np.ndarray | None = None  # (h, w), share of a pixel that sees a surface, where the sky is hidden
     found: file_resolution.Found | None = None  # what the map was decoded from
     posterior: Posterior | None = None
     photo: Photo | None = None
     outliers: np.ndarray | None = None  # bool (h, w), pixels of the photograph that light does not explain
     variants: list[Variant] = field(default_factory=list)
-    memory: inputs.Given | None = None  # what was given as an array or object and not as a file
+    replacements: inputs.Replacements = inputs.NO_REPLACEMENTS
     base: Path | None = None  # what file names in scene parameters are relative to
 
     @property
@@ -200,8 +200,8 @@ class Result:
         for _ in range(count):
             envmap = before.copy()
             envmap[rows] = self.found.representation.decode(self.posterior.sample(rng)).numpy()
-            adjusted, _ = adjustments.adjust(envmap, settings.lights, settings.output, self.given.scale)
-            drawn.append(self.given.as_stored(adjusted, self.found.turn_degrees))
+            adjusted, _ = adjustments.adjust(envmap, settings.lights, settings.output, self.input_map.scale)
+            drawn.append(self.input_map.as_stored(adjusted, self.found.turn_degrees))
         return np.stack(drawn) if drawn else np.zeros((0, *self.envmap.shape), np.float32)
 
     def save(self, folder: str | PathLike[str]) -> list[str]:
@@ -235,8 +235,8 @@ class Result:
         warnings = [*self.warnings]
         with output_folder.alone(folder):
             read = [*output_folder.inputs_of(settings, self.base)]
-            read += self.memory.scene.files if self.memory and self.memory.scene else ()
+            read += self.replacements.scene.files if self.replacements.scene else ()
             output_folder.prepare_folder(folder, output_folder.names(folder), read)
-            settings = run_folder.write_given(settings, folder, self.memory, warnings)
+            settings = run_folder.write_given(settings, folder, self.replacements, warnings)
             own = replace(self, settings=settings, metrics=copy.deepcopy(self.metrics), warnings=warnings)
             return run_folder.write(folder, own, import_s=0.0)

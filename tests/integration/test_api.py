@@ -85,7 +85,7 @@ def test_a_picture_is_paint_or_a_rendering_and_what_is_saved_runs_to_the_same_ma
     assert found.scene.parameters == {"roughness": 0.4}
     assert found.target.kind == kind and found.target.spp == 8
     again = pipeline.run(found)
-    assert np.array_equal(again.envmap, result.envmap) and again.given.size == (32, 16)
+    assert np.array_equal(again.envmap, result.envmap) and again.input_map.size == (32, 16)
     before = result.metrics["timing"]["total_s"], list(result.warnings)
     result.save(tmp_path / "out")  # a second time: the first is moved aside, and the result is as it was
     assert (tmp_path / "out" / "earlier-1" / "given_envmap.exr").exists()
@@ -111,7 +111,7 @@ def test_a_built_scene_is_edited_and_has_its_own_map_again(tmp_path):
     assert np.array_equal(built_scene.own_map(scene), own)
     assert float(np.array(mi.traverse(scene)["sky.scale"]).item()) == 2
     # The map is in the units of the scene's own, which scale multiplies.
-    assert np.array_equal(result.given.stored, own) and np.array_equal(result.maps["initial"], 2 * own)
+    assert np.array_equal(result.input_map.stored, own) and np.array_equal(result.maps["initial"], 2 * own)
     assert np.allclose(result.maps["target"], 2 * other) and result.render.shape == (8, 12, 3)
     warned = result.save(tmp_path / "out")
     assert any("the scene was given as an object" in line for line in warned)

@@ -638,4 +638,4 @@ def test_what_a_run_leaves_changes_nothing_of_the_file_but_its_sky(tmp_path, rng
     envmap, _ = inputs.load_map(config.Input(envmap="scene", width=16), again)
     rendered = again.render(envmap, 256, 3)
     np.testing.assert_allclose(rendered.mean(), result.render.mean(), rtol=0.02)
-    np.testing.assert_allclose(envmap, 2 * result.given.radiance, rtol=1e-5)
+    np.testing.assert_allclose(envmap, 2 * result.input_map.radiance, rtol=1e-5)

@@ -115,7 +115,8 @@ def edit(
         given = inputs.Replacements(loaded, **arrays)
         result = run(_of_arrays(chosen, arrays), base=base, watch=watch, replacements=given)
     of_codes = [_warning_of_codes(name, named[name]) for name in arrays if name != "mask"]
-    result.warnings[:0] = filter(None, of_codes)
+    if any(of_codes):
+        result.warnings[:0] = filter(None, of_codes)
     return result
 
 

@@ -21,9 +21,9 @@ from envedit.config.validators import (
     Choice,
     Either,
     Integer,
+    ListOf,
     Number,
     Numbers,
-    Points,
     Schema,
     String,
     WantedError,
@@ -81,6 +81,12 @@ class Tables(Check):
         keys = {key: {**check.schema(), "description": about} for key, (check, about) in self.keys.items()}
         entry = {"type": "object", "properties": keys, **self.rules, "additionalProperties": False}
         return {"type": "array", "items": entry} | ({} if self.most is None else {"maxItems": self.most})
+
+
+def _points(point: Check, names: str, least: int, most: int | None = None) -> Check:
+    """Return the check of a list of points, each a list of two numbers of these names."""
+    count = f"at least {least}" if most is None else f"{least} to {most}"
+    return ListOf(point, least, most, words=f"[[{names}], ...], {count}")
 
 
 # ---- Lights: moved, changed or added by hand before the edit -----------------------------------------------
@@ -199,12 +205,12 @@ REGION_KEYS: dict[str, tuple[Check, str]] = {
         "around it",
     ),
     "points": (
-        Points(_DIRECTION, _ANGLES, 1, MOST_POINTS),
+        _points(_DIRECTION, _ANGLES, 1, MOST_POINTS),
         "middle line of a brush, directions [azimuth, elevation] of the map in degrees",
     ),
     "radius": (Number(0, 180, positive=True), "of the brush, degrees; only with points, and needed there"),
     "polygon": (
-        Points(_DIRECTION, _ANGLES, 3, MOST_POINTS),
+        _points(_DIRECTION, _ANGLES, 3, MOST_POINTS),
         "corners of a region, joined by straight lines in the lat-long image; across its edge azimuths go on "
         "below 0 or above 360",
     ),
@@ -314,10 +320,10 @@ _AMOUNTS = {"shadow": Number(0, 1), "light": Number(0, 1e6), "contrast": Number(
 STROKE_KEYS: dict[str, tuple[Check, str]] = {
     "type": (Choice(*STROKES), "what it does to the rendering"),
     "points": (
-        Points(_POINT, "x, y", 1),
+        _points(_POINT, "x, y", 1),
         "middle line of a brush: [x, y], to the right and downwards from the upper left corner",
     ),
-    "polygon": (Points(_POINT, "x, y", 3), "corners of a region"),
+    "polygon": (_points(_POINT, "x, y", 3), "corners of a region"),
     "ellipse": (
         _ELLIPSE,
         "[cx, cy, rx, ry] or [cx, cy, rx, ry, degrees]: centre, radii and turn of a region",

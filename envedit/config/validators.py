@@ -194,36 +194,6 @@ class Numbers(Check):
         return {"type": "array", "items": items, "minItems": len(items), "maxItems": len(items)}
 
 
-@dataclass(frozen=True)
-class Points(Check):
-    """A list of points, each a list of two numbers; ``most`` of None: any number of them."""
-
-    point: Numbers
-    names: str  # of the two numbers
-    least: int
-    most: int | None = None
-
-    def __call__(self, value: Any) -> list[list[float]]:
-        most = math.inf if self.most is None else self.most
-        if not isinstance(value, list | tuple) or not self.least <= len(value) <= most:
-            raise WantedError(str(self))
-        points = []
-        for i, place in enumerate(value):
-            try:
-                points.append(self.point(place))
-            except WantedError as error:
-                raise WantedError(f"{error} at point {i}") from None
-        return points
-
-    def __str__(self) -> str:
-        count = f"at least {self.least}" if self.most is None else f"{self.least} to {self.most}"
-        return f"[[{self.names}], ...], {count}"
-
-    def schema(self) -> Schema:
-        points: Schema = {"type": "array", "items": self.point.schema(), "minItems": self.least}
-        return points if self.most is None else points | {"maxItems": self.most}
-
-
 class Pair(Numbers):
     """Two values of one check, as a tuple."""
 
@@ -238,26 +208,40 @@ class Pair(Numbers):
 
 
 class ListOf(Check):
-    """A list of what another check accepts, as a tuple."""
+    """A list of what another check accepts, as a tuple; ``most`` of None: any number of it."""
 
-    words = "a list"
-
-    def __init__(self, check: Check, least: int = 0, unique: bool = False) -> None:
+    def __init__(
+        self,
+        check: Check,
+        least: int = 0,
+        most: int | None = None,
+        unique: bool = False,
+        words: str = "a list",
+    ) -> None:
         self.check = check
         self.least = least
+        self.most = most
         self.unique = unique
+        self.words = words
 
     def __call__(self, value: Any) -> tuple[Any, ...]:
-        if not isinstance(value, list | tuple) or len(value) < self.least:
+        most = math.inf if self.most is None else self.most
+        if not isinstance(value, list | tuple) or not self.least <= len(value) <= most:
             raise WantedError(self.words)
-        values = tuple(self.check(v) for v in value)
+        values = []
+        for i, entry in enumerate(value):
+            try:
+                values.append(self.check(entry))
+            except WantedError as error:
+                raise WantedError(f"{error} at entry {i}") from None
         if self.unique and len({*values}) < len(values):
             raise WantedError(self.words)
-        return values
+        return tuple(values)
 
     def schema(self) -> Schema:
-        values: Schema = {"type": "array", "items": self.check.schema()}
-        return values | ({"minItems": self.least} if self.least else {}) | {"uniqueItems": self.unique}
+        values: Schema = {"type": "array", "items": self.check.schema(), "uniqueItems": self.unique}
+        values |= {"minItems": self.least} if self.least else {}
+        return values if self.most is None else values | {"maxItems": self.most}
 
 
 class Either(Check):

@@ -311,7 +311,7 @@ DOT = "points = [[0.5, 0.5]], width = 0.1"
     (f"type = 'shadow', {DOT}, widht = 1", "target.strokes[1]: has no key 'widht'; did you mean width?"),
     ("type = 'shadow'", "target.strokes[1]: got no shape, expected one of points, polygon"),
     ("type = 'blur', radius = 1, width = 1", "strokes[1].width: got 1.0, expected none but with points"),
-    ("type = 'light', width = 1, points = [[0, 0], [1]]", "expected a list of 2 numbers at point 1"),
+    ("type = 'light', width = 1, points = [[0, 0], [1]]", "expected a list of 2 numbers at entry 1"),
     ("type = 'light', polygon = [[0, 0], [1, 1]]", "at least 3"),
     ("type = 'light', ellipse = [0, 0, 1]", "ellipse: got [0, 0, 1], expected [cx, cy, rx, ry] or"),
     (

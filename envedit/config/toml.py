@@ -109,7 +109,7 @@ def from_dict(
             layer = {key: layer}
         layer = _checked_layer(layer, f"--set {show(text)}")
         assigned = presets.overlaid(assigned, layer)
-    file = _checked_layer(_not_replaced(table, assigned), name)
+    file = _checked_layer(_replaced(table, assigned), name)
 
     chosen = assigned.get("preset", file.get("preset", "standard"))
     if preset is not None:
@@ -125,17 +125,16 @@ def from_dict(
         raise ConfigError(f"{name}: {error}") from None
 
 
-def _not_replaced(table: Any, assigned: dict[str, Any]) -> Any:
-    """Return what a file gives without the values that overrides replace, which may be unusable."""
+def _replaced(table: Any, assigned: dict[str, Any]) -> Any:
+    """Return what a file gives with the values of overrides in place of its own, which may be unusable."""
     if not isinstance(table, dict):
         return table
-    left = {}
+    replaced = {}
     for key, value in table.items():
-        if key not in assigned:
-            left[key] = value
-        elif isinstance(value, dict) and isinstance(assigned[key], dict):
-            left[key] = _not_replaced(value, assigned[key])
-    return left
+        other = assigned.get(key, value)
+        both = isinstance(value, dict) and isinstance(other, dict)
+        replaced[key] = _replaced(value, other) if both else other
+    return replaced
 
 
 def _checked_layer(layer: Any, where: str) -> dict[str, Any]:

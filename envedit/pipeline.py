@@ -236,15 +236,15 @@ class _Edit:
         if transport and target.coverage is not None:
             rendering = transport.resolved(self.original).apply(mi.TensorXf(self.original)).numpy()
             target = target.seen_as(rendering, target.initial)
-        self.start = preparation.edit(target)
-        self.job = self.start.job
-        self.degrees = self.start.degrees
-        self.frozen = self.start.frozen
+        self.prepared = preparation.edit(target)
+        self.job = self.prepared.job
+        self.degrees = self.prepared.degrees
+        self.frozen = self.prepared.frozen
         self.transport = self.job.renderer.transport
-        self.notes += [*self.job.renderer.choices, *self.start.notes]
+        self.notes += [*self.job.renderer.choices, *self.prepared.notes]
 
     def _traced(self):
-        preparation = Preparation(
+        return Preparation(
             self.settings,
             self.small,
             self.map,
@@ -253,9 +253,7 @@ class _Edit:
             self.watch,
             self.dists,
             self.clock,
-        )
-        preparation.trace()
-        return preparation
+        ).traced()
 
     def solve(self, resume):
         """Find the map that explains the target."""
@@ -264,7 +262,7 @@ class _Edit:
         self.warnings += config.unused(self.settings, None if no_step else solver)
         with self.clock("edit_s"):
             self.watch.stage("editing")
-            self.params, self.state = self.start.optimise(resume)
+            self.params, self.state = self.prepared.optimise(resume)
             self.transport = self.job.renderer.transport
             self.edited = self.solved_map = self.job.decode(self.params)
         photo = self.target.photo
@@ -376,10 +374,10 @@ class _Edit:
         """Render the other explanations of paint, and measure how far they follow it."""
         target, tonemap = self.target, self.settings.output.tonemap
         seen = None if self.scene.alpha is None else self.scene.alpha > 0
-        for explanation in self.start.layers.others if self.job else ():
+        for explanation in self.prepared.layers.others if self.job else ():
             with self.clock("judge_s"):
                 self.watch.stage("rendering other explanations")
-                changed, _ = self._adjusted(self.start.layers.map_of(explanation))
+                changed, _ = self._adjusted(self.prepared.layers.map_of(explanation))
                 render = self.scene.render(changed, variants.SPP, self.seeds.judged)
                 followed = metrics.painted(
                     render, target.picture, target.initial, target.coverage, tonemap, seen
@@ -559,8 +557,8 @@ class _Edit:
         """Return what the run has found."""
         # ---- What is said of the edit
         job, notes = self.job, self.notes
-        if job and self.start.layers.note:
-            notes.append(self.start.layers.note)
+        if job and self.prepared.layers.note:
+            notes.append(self.prepared.layers.note)
         if self.others:
             notes.append(f"other explanations: {', '.join(one.summary for one in self.others)}")
         if lights := light_list.summary(self.lights, len(self.original)):
@@ -605,7 +603,7 @@ class _Edit:
             input_map=self.map,
             alpha=self.scene.alpha,
             found=found,
-            posterior=self.start.layers.posterior if job else None,
+            posterior=self.prepared.layers.posterior if job else None,
             photo=self.target.photo,
             outliers=self.outliers,
             variants=self.others,

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -79,7 +79,7 @@ class Preparation:
     watch: Watch  # receives progress
     dists: distances.Dists | None  # as for :class:`.edit_state.EditState`
     clock: Callable[[str], AbstractContextManager]  # ``with clock(name):`` adds up seconds
-    renderer: renderers.Renderer | None = None  # once :meth:`trace` has made it
+    renderer: renderers.Renderer | None = None  # once :meth:`traced` has made it
     _recordings: initialization.Recordings | None = None
 
     @property
@@ -87,13 +87,14 @@ class Preparation:
         """The map's radiance, (H, W, 3)."""
         return self.map.radiance
 
-    def trace(self) -> None:
+    def traced(self) -> Self:
         """Trace the light transport, or prepare the path tracer."""
         with self.clock("transport_s"):
             stored = self.settings.renderer.kind == "transport"
             self.watch.stage("tracing light transport" if stored else "preparing the path tracer")
             shape = self.original.shape[:2]
             self.renderer = renderers.make(self.settings, self.scene, shape, self._count)
+        return self
 
     def detailed(self, target: Target) -> bool:
         """Whether the target determines detail of the sky, as a mirror's does: finer grids than usual."""

@@ -125,7 +125,7 @@ def from_dict(
         raise ConfigError(f"{name}: {error}") from None
 
 
-def _replaced(table: Any, assigned: dict[str, Any]) -> Any:
+def _replaced(table: Any, assigned: Any) -> Any:
     """Return what a file gives with the values of overrides in place of its own, which may be unusable."""
     if not isinstance(table, dict):
         return table

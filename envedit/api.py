@@ -40,7 +40,7 @@ def edit(
     mask: ArrayLike | None = None,
     target_map: ArrayLike | None = None,
     scene: Scene | mi.Scene | Mapping[str, Any] | str | PathLike[str] | None = None,
-    base: Path | None = None,
+    base: str | PathLike[str] | None = None,
     watch: Watch | None = None,
 ) -> Result:
     """Carry out an edit without writing files.
@@ -68,7 +68,7 @@ def edit(
         What the map lights: what :func:`load_scene` returned; a scene that Mitsuba has built, lit by an
         ``envmap``, rendered at the size of its film, with its own map again when this returns; a dict of
         ``mi.load_dict``; or a file. Without ``envmap``, a built scene's own map is edited.
-    base : Path, optional
+    base : path, optional
         Folder that file names in scene parameters are relative to; by default the configuration's.
     watch : Watch, optional
         Receives progress.
@@ -96,11 +96,12 @@ def edit(
         raise ConfigError("mask: got one without a target; expected both: it says where that was painted")
     if target is not None and target_map is not None:
         raise ConfigError("target, target_map: got both, expected one: a picture, or a map to render under")
+    _require("watch", watch, Watch, "a Watch")
+    _require("base", base, str | PathLike, "a path")
     named = {"envmap": envmap, "target": target, "mask": mask, "target_map": target_map}
     arrays = {name: _array(name, value) for name, value in named.items() if value is not None}
-    of_codes = [_warning_of_codes(name, named[name]) for name in arrays if name != "mask"]
     chosen, folder = _settings(settings)
-    base = base or folder
+    base = folder if base is None else Path(base)
     mi.set_variant(chosen.variant)
     with contextlib.ExitStack() as stack:
         loaded = None
@@ -111,14 +112,9 @@ def edit(
                 stack.enter_context(built_scene.kept(scene))
             loaded = built_scene.load(scene, chosen.scene, base)
             chosen = _of_scene(chosen, loaded)
-        memory = inputs.Given(
-            scene=loaded,
-            envmap=arrays.get("envmap"),
-            target_map=arrays.get("target_map"),
-            picture=arrays.get("target"),
-            mask=arrays.get("mask"),
-        )
-        result = run(_of_arrays(chosen, arrays), base=base, watch=watch, memory=memory)
+        given = inputs.Replacements(loaded, **arrays)
+        result = run(_of_arrays(chosen, arrays), base=base, watch=watch, replacements=given)
+    of_codes = [_warning_of_codes(name, named[name]) for name in arrays if name != "mask"]
     if any(of_codes):
         result.warnings[:0] = filter(None, of_codes)
     return result
@@ -131,7 +127,7 @@ def fit(
     seed: int = 0,
     rows: tuple[int, int] | None = None,
     *,
-    folder: Path | None = None,
+    folder: str | PathLike[str] | None = None,
     progress: Callable[[int, int, float], None] | None = None,
 ) -> Fitted:
     """Fit a SIREN to an image in normalised log space, under weight perturbation (paper, Sec. 4).
@@ -148,7 +144,7 @@ def fit(
         Seed of the initial weights.
     rows : (int, int), optional
         First row of the image in its map, and the rows of that map; None: the image is a whole map.
-    folder : Path, optional
+    folder : path, optional
         Where fits are kept under a hash of image and settings, half-made ones too; None: nowhere.
     progress : callable, optional
         Called with (epoch, epochs, loss) now and then.
@@ -175,6 +171,11 @@ def fit(
         network = config.Representation(**{"kind": "siren", **network})
     if isinstance(settings, Mapping):
         settings = config.Fit(**settings)
+    _require("network", network, config.Representation, "a Representation or a dict of its keys")
+    _require("settings", settings, config.Fit, "a Fit or a dict of its keys")
+    _require("folder", folder, str | PathLike, "a path")
+    _require("progress", progress, Callable, "a function of (epoch, epochs, loss)")
+    folder = None if folder is None else Path(folder)
     _select_variant()
     return siren.fit(pixels, network, settings, seed, rows, folder=folder, progress=progress)
 
@@ -186,7 +187,7 @@ def load_scene(
     *,
     parameters: Mapping[str, Any] | None = None,
     sensors: str | Sequence[int | str] = (0,),
-    base: Path | None = None,
+    base: str | PathLike[str] | None = None,
 ) -> Scene:
     """Load a scene for :class:`LightTransport`, :func:`edit`, and to render under any map.
 
@@ -201,7 +202,7 @@ def load_scene(
         Values for the defaults, ``$name``, of the XML.
     sensors : "all" or sequence of int and str
         Sensors whose pictures a rendering consists of, below each other.
-    base : Path, optional
+    base : path, optional
         Folder that file names in ``parameters`` are relative to; by default the working folder.
 
     Returns
@@ -216,6 +217,7 @@ def load_scene(
     InputError
         A file is missing or damaged, or the scene has something that is not supported.
     """
+    _require("base", base, str | PathLike, "a path")
     _select_variant()
     settings = config.Scene(
         width=width,
@@ -312,6 +314,12 @@ def _of_scene(settings: config.Config, scene: Scene) -> config.Config:
         scale=settings.scene.scale,
     )
     return replace(settings, scene=described)
+
+
+def _require(name: str, value: object, kind: Any, expected: str) -> None:
+    """Raise ConfigError unless an argument is None or of a kind."""
+    if value is not None and not isinstance(value, kind):
+        raise ConfigError(f"{name}: got {show(value)}, expected {expected}")
 
 
 def _settings(settings: object) -> tuple[config.Config, Path | None]:

@@ -28,16 +28,20 @@ _ROUNDING = 1e-6  # of a texel's largest channel
 
 
 @dataclass(frozen=True)
-class Given:
+class Replacements:
     """Arrays and objects that take the place of a configuration's files."""
 
     scene: Scene | None = None
     # (H, 2 H, 3), the map to edit, linear radiance in the units of a file, which the ``scale`` multiplies
     envmap: np.ndarray | None = None
     target_map: np.ndarray | None = None  # (H, 2 H, 3), the map under which the target is rendered; likewise
-    picture: np.ndarray | None = None  # (h, w, 3), a painted picture, linear radiance
+    target: np.ndarray | None = None  # (h, w, 3), a painted picture, linear radiance
     # (h, w), where it was painted, in [0, 1]; None: where it differs from the initial rendering
     mask: np.ndarray | None = None
+
+
+NO_REPLACEMENTS = Replacements()
+"""Everything is read from the configuration's files."""
 
 
 @dataclass(frozen=True)
@@ -266,30 +270,30 @@ def notes(settings: config.Input, scene: Scene, input_map: InputMap) -> list[str
     """Say which map a run took and what the scene's file has that is used otherwise."""
     own = scene.own
     source = input_map.source
-    first = []
-    last = []
+    lines = []
     if source == SCENE and own.light is not None:
-        first.append(f"map: the scene's own light, {own.light.plugin}")
+        lines.append(f"map: the scene's own light, {own.light.plugin}")
     elif settings.envmap == AUTO and source == SUNSKY:
-        first.append("map: the analytic sky, as the scene is made for any map")
+        lines.append("map: the analytic sky, as the scene is made for any map")
     elif settings.envmap == AUTO:
-        first.append(f"map: the scene's own, {source}")
-    of_scene = source == SCENE
-    if own.file is not None:
-        of_scene |= os.path.realpath(source) == os.path.realpath(own.file)  # by whatever names
-    if own.scale != 1 and of_scene:
-        first.append(f"the scene multiplies it by scale {own.scale:g}")
-    elif own.scale != 1:
-        first.append(
-            f"the scene multiplies the map (which is not the scene's own) by scale {own.scale:g}; "
-            "scene.scale = 1 drops that"
-        )
+        lines.append(f"map: the scene's own, {source}")
+    if own.scale != 1:
+        # Files are the same by whatever names.
+        same_file = own.file is not None and os.path.realpath(source) == os.path.realpath(own.file)
+        if source == SCENE or same_file:
+            lines.append(f"the scene multiplies it by scale {own.scale:g}")
+        else:
+            lines.append(
+                f"the scene multiplies the map (which is not the scene's own) by scale {own.scale:g}; "
+                "scene.scale = 1 drops that"
+            )
+    lines += scene.notes
     if input_map.unclipped:
-        last.append(f"input.unclip: {input_map.unclipped}")
+        lines.append(f"input.unclip: {input_map.unclipped}")
     if input_map.chromaticities is not None:
         space = primaries.name_of(input_map.chromaticities)
-        last.append(f"map in {space}: edited in Rec. 709, written in {space}")
-    return [*first, *scene.notes, *last]
+        lines.append(f"map in {space}: edited in Rec. 709, written in {space}")
+    return lines
 
 
 def share(scene: Scene, radiance: np.ndarray, seed: int) -> float:

@@ -62,19 +62,19 @@ def run(
     resume: bool = False,
     base: Path | None = None,
     watch: Watch | None = None,
-    memory: inputs.Given | None = None,
+    replacements: inputs.Replacements = inputs.NO_REPLACEMENTS,
 ) -> Result:
     """Carry out an edit.
 
     Checkpoints are written to ``folder`` while the loop runs; None: nowhere. With ``resume`` the run
     continues from the checkpoint that is there, if there is one. ``base`` and ``watch`` are as of
-    :func:`.api.edit`; ``memory`` has arrays and a scene in place of the configuration's files.
+    :func:`.api.edit`; ``replacements`` has arrays and a scene in place of the configuration's files.
 
     EnveditError has the exit code of its cause. Interrupted is raised after Ctrl-C during the edit; the
     checkpoint, where there is one, is of the last step that was kept. Stopped if the optimisation cannot go
     on.
     """
-    edit = _Edit(settings, folder, base, watch or Watch(), memory or inputs.Given())
+    edit = _Edit(settings, folder, base, watch or Watch(), replacements)
     try:
         edit.load()
         if edit.to_solve:
@@ -148,7 +148,7 @@ class _Edit:
     degrees = 0.0
     level = 1.0
 
-    def __init__(self, settings, folder, base, watch, memory):
+    def __init__(self, settings, folder, base, watch, replacements):
         self.begun = time.perf_counter()
         self.clock = _Clock()
         networks = installed.load(settings)
@@ -158,7 +158,7 @@ class _Edit:
         self.folder = folder
         self.base = base
         self.watch = watch
-        self.memory = memory
+        self.replacements = replacements
         self.seeds = Seeds(settings.seed)
         self.notes: list[str] = []
         self.warnings: list[str] = []
@@ -174,8 +174,9 @@ class _Edit:
         settings = self.settings
         with self.clock("target_s"):
             self.watch.stage("loading")
-            self.scene = self.small = self.memory.scene or inputs.load_scene(settings.scene, self.base)
-            self.map = inputs.read_map(settings.input, self.scene, settings.input.width, self.memory.envmap)
+            array = self.replacements.envmap
+            self.scene = self.small = self.replacements.scene or inputs.load_scene(settings.scene, self.base)
+            self.map = inputs.read_map(settings.input, self.scene, settings.input.width, array)
             self.original = self.map.radiance
             self.rows = inputs.active_rows(settings.input.rows, len(self.original))
             self.warnings += self.map.warnings
@@ -191,14 +192,7 @@ class _Edit:
             self.small = working_size.smaller(settings, self.scene)
             renderers.check(settings, self.small, self.original.shape[:2])
             self.watch.stage("rendering the target")
-            self.target = make_target(
-                settings,
-                self.scene,
-                self.original,
-                picture=self.memory.picture,
-                mask=self.memory.mask,
-                other=self.memory.target_map,
-            )
+            self.target = make_target(settings, self.scene, self.original, self.replacements)
             self.warnings += self.target.warnings
 
     @property
@@ -243,28 +237,24 @@ class _Edit:
         if transport and target.coverage is not None:
             rendering = transport.resolved(self.original).apply(mi.TensorXf(self.original)).numpy()
             target = target.seen_as(rendering, target.initial)
-        self.start = preparation.edit(target)
-        self.job = self.start.job
-        self.degrees = self.start.degrees
-        self.frozen = self.start.frozen
+        self.prepared = preparation.edit(target)
+        self.job = self.prepared.job
+        self.degrees = self.prepared.degrees
+        self.frozen = self.prepared.frozen
         self.transport = self.job.renderer.transport
-        self.notes += [*self.job.renderer.choices, *self.start.notes]
+        self.notes += [*self.job.renderer.choices, *self.prepared.notes]
 
     def _traced(self):
-        preparation = Preparation(
+        return Preparation(
             self.settings,
             self.small,
-            self.original,
+            self.map,
             self.rows,
             self.folder,
             self.watch,
             self.dists,
             self.clock,
-            self.map.locked,
-            self.map.kept,
-        )
-        preparation.trace()
-        return preparation
+        ).traced()
 
     def solve(self, resume):
         """Find the map that explains the target."""
@@ -273,7 +263,7 @@ class _Edit:
         self.warnings += config.unused(self.settings, None if no_step else solver)
         with self.clock("edit_s"):
             self.watch.stage("editing")
-            self.params, self.state = self.start.optimise(resume)
+            self.params, self.state = self.prepared.optimise(resume)
             self.transport = self.job.renderer.transport
             self.edited = self.solved_map = self.job.decode(self.params)
         photo = self.target.photo
@@ -308,7 +298,7 @@ class _Edit:
 
         Where these leave float32, it is cut at what the file could have been read with.
         """
-        stop.given = self.map
+        stop.input_map = self.map
         try:
             stop.envmap = self.map.as_stored(stop.envmap, self.degrees)
         except NumericalError:
@@ -385,10 +375,10 @@ class _Edit:
         """Render the other explanations of paint, and measure how far they follow it."""
         target, tonemap = self.target, self.settings.output.tonemap
         seen = None if self.scene.alpha is None else self.scene.alpha > 0
-        for explanation in self.start.layers.others if self.job else ():
+        for explanation in self.prepared.layers.others if self.job else ():
             with self.clock("judge_s"):
                 self.watch.stage("rendering other explanations")
-                changed, _ = self._adjusted(self.start.layers.map_of(explanation))
+                changed, _ = self._adjusted(self.prepared.layers.map_of(explanation))
                 render = self.scene.render(changed, variants.SPP, self.seeds.judged)
                 followed = metrics.painted(
                     render, target.picture, target.initial, target.coverage, tonemap, seen
@@ -567,8 +557,8 @@ class _Edit:
         """Return what the run has found."""
         # ---- What is said of the edit
         job, notes = self.job, self.notes
-        if job and self.start.layers.note:
-            notes.append(self.start.layers.note)
+        if job and self.prepared.layers.note:
+            notes.append(self.prepared.layers.note)
         if self.others:
             notes.append(f"other explanations: {', '.join(one.summary for one in self.others)}")
         if lights := light_list.summary(self.lights, len(self.original)):
@@ -610,14 +600,14 @@ class _Edit:
             frozen=self.frozen,
             scene=self.scene.path,
             reach=self.feasible,
-            given=self.map,
+            input_map=self.map,
             alpha=self.scene.alpha,
             found=found,
-            posterior=self.start.layers.posterior if job else None,
+            posterior=self.prepared.layers.posterior if job else None,
             photo=self.target.photo,
             outliers=self.outliers,
             variants=self.others,
             settings=self.settings,
-            memory=self.memory,
+            replacements=self.replacements,
             base=self.base,
         )

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -23,6 +23,7 @@ from envedit.core.rows import Rows
 from envedit.core.seeds import Seeds
 from envedit.core.types import Params
 from envedit.images import map_regions
+from envedit.inputs import InputMap
 from envedit.losses.perceptual import distances
 from envedit.representations.layers import below_horizon
 from envedit.representations.siren.siren import Siren
@@ -72,25 +73,28 @@ class Preparation:
 
     settings: config.Config  # what is to be done
     scene: Scene  # what is lit
-    original: np.ndarray  # (H, W, 3), the map
+    map: InputMap  # what is edited; where it is locked or kept, the sky is not turned
     rows: Rows  # its active rows
     folder: Path | None  # of the checkpoint
     watch: Watch  # receives progress
     dists: distances.Dists | None  # as for :class:`.edit_state.EditState`
     clock: Callable[[str], AbstractContextManager]  # ``with clock(name):`` adds up seconds
-    # (H, W, 3), radiance of lights that layers leave as they are; the sky is then not turned
-    locked: np.ndarray | None = None
-    kept: np.ndarray | None = None  # (H, W), how far texels stay as they are; the sky is then not turned
-    renderer: renderers.Renderer | None = None  # once :meth:`trace` has made it
+    renderer: renderers.Renderer | None = None  # once :meth:`traced` has made it
     _recordings: initialization.Recordings | None = None
 
-    def trace(self) -> None:
+    @property
+    def original(self) -> np.ndarray:
+        """The map's radiance, (H, W, 3)."""
+        return self.map.radiance
+
+    def traced(self) -> Self:
         """Trace the light transport, or prepare the path tracer."""
         with self.clock("transport_s"):
             stored = self.settings.renderer.kind == "transport"
             self.watch.stage("tracing light transport" if stored else "preparing the path tracer")
             shape = self.original.shape[:2]
             self.renderer = renderers.make(self.settings, self.scene, shape, self._count)
+        return self
 
     def detailed(self, target: Target) -> bool:
         """Whether the target determines detail of the sky, as a mirror's does: finer grids than usual."""
@@ -153,7 +157,7 @@ class Preparation:
         chosen, transport = self.settings.representation.turn, self.renderer.transport
         if chosen is False or transport is None or not self.rows.all:
             return None
-        if self.locked is not None or self.kept is not None:
+        if self.map.locked is not None or self.map.kept is not None:
             return None
         if chosen == "auto" and target.coverage is not None:  # most of a painted picture is to stay
             return None
@@ -252,8 +256,8 @@ class Preparation:
         frozen = self._frozen(determined=bool(octaves) or not job.newton)
         if frozen is not None and frozen.any():
             job.free = ~frozen[rows]
-        if self.kept is not None and kind != "layers":  # which know it themselves
-            open_texels = self.kept[rows] < map_regions.KEPT_SHARE
+        if self.map.kept is not None and kind != "layers":  # which know it themselves
+            open_texels = self.map.kept[rows] < map_regions.KEPT_SHARE
             job.free = open_texels if job.free is None else job.free & open_texels
 
         # ---- How bright the sky of a network begins
@@ -322,8 +326,8 @@ class Preparation:
             lambda done, total, loss: self.watch.progress(done, total, f"loss {loss:.4g}"),
             self.rows.place,
             horizon,
-            None if self.locked is None else self.locked[self.rows.slice],
-            None if self.kept is None else self.kept[self.rows.slice],
+            None if self.map.locked is None else self.map.locked[self.rows.slice],
+            None if self.map.kept is None else self.map.kept[self.rows.slice],
         )
 
     def _explained(self, layers, octaves, notes, transport):

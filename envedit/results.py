@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import itertools
 from dataclasses import dataclass, field, replace
 from os import PathLike
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from envedit import config, inputs
+from envedit.config.validators import Integer, named, show
 from envedit.core import latlong
 from envedit.core.errors import ConfigError, counted
 from envedit.core.extras import required
@@ -85,14 +85,14 @@ class Result:
     frozen: np.ndarray | None = None
     scene: Path | None = None  # its file
     reach: Reach | None = None
-    given: inputs.InputMap | None = None  # the map that was edited
+    input_map: inputs.InputMap | None = None  # the map that was edited
     alpha: np.ndarray | None = None  # (h, w), share of a pixel that sees a surface, where the sky is hidden
     found: file_resolution.Found | None = None  # what the map was decoded from
     posterior: Posterior | None = None
     photo: Photo | None = None
     outliers: np.ndarray | None = None  # bool (h, w), pixels of the photograph that light does not explain
     variants: list[Variant] = field(default_factory=list)
-    memory: inputs.Given | None = None  # what was given as an array or object and not as a file
+    replacements: inputs.Replacements = inputs.NO_REPLACEMENTS
     base: Path | None = None  # what file names in scene parameters are relative to
 
     @property
@@ -185,8 +185,11 @@ class Result:
         Raises
         ------
         ConfigError
-            The edit was not solved by Gauss-Newton steps, or these leave open what the posterior is.
+            The edit was not solved by Gauss-Newton steps, or these leave open what the posterior is; or
+            ``count`` or ``seed`` is no whole number of at least 0.
         """
+        count = named("count", Integer(0, 2**31), count)
+        seed = named("seed", Integer(0, 2**32 - 1), seed)
         if self.found is None or self.posterior is None or self.posterior.sample is None:
             raise ConfigError('Result.samples: needs an edit by layers with optimizer.kind = "gauss-newton"')
         settings = self.settings
@@ -197,8 +200,8 @@ class Result:
         for _ in range(count):
             envmap = before.copy()
             envmap[rows] = self.found.representation.decode(self.posterior.sample(rng)).numpy()
-            adjusted, _ = adjustments.adjust(envmap, settings.lights, settings.output, self.given.scale)
-            drawn.append(self.given.as_stored(adjusted, self.found.turn_degrees))
+            adjusted, _ = adjustments.adjust(envmap, settings.lights, settings.output, self.input_map.scale)
+            drawn.append(self.input_map.as_stored(adjusted, self.found.turn_degrees))
         return np.stack(drawn) if drawn else np.zeros((0, *self.envmap.shape), np.float32)
 
     def save(self, folder: str | PathLike[str]) -> list[str]:
@@ -218,17 +221,21 @@ class Result:
 
         Raises
         ------
+        ConfigError
+            ``folder`` is no path.
         InputError
             The folder cannot be used, or a file cannot be written.
         """
         from envedit.report import output_folder, run_folder
 
+        if not isinstance(folder, str | PathLike):
+            raise ConfigError(f"folder: got {show(folder)}, expected a path")
         folder = Path(folder).absolute()
         settings = replace(self.settings, output=replace(self.settings.output, dir=str(folder)))
         warnings = [*self.warnings]
-        given = self.memory.scene.files if self.memory and self.memory.scene else ()
-        read = itertools.chain(output_folder.inputs_of(settings, self.base), given)
+        of_scene = self.replacements.scene.files if self.replacements.scene else ()
+        read = [*output_folder.inputs_of(settings, self.base), *of_scene]
         with output_folder.results_in(folder, output_folder.names(folder), read):
-            settings = run_folder.write_given(settings, folder, self.memory, warnings)
+            settings = run_folder.write_given(settings, folder, self.replacements, warnings)
             own = replace(self, settings=settings, metrics=copy.deepcopy(self.metrics), warnings=warnings)
             return run_folder.write(folder, own, import_s=0.0)

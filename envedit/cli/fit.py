@@ -4,18 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import mitsuba as mi
-
-from envedit import config, inputs
+from envedit import config
 from envedit.cli import doctor
 from envedit.cli.console import Console, add_overrides, exit_code, make_parser
 from envedit.config import presets
 from envedit.core.array_cache import cache_folder
 from envedit.core.atomic_files import write_atomically
-from envedit.images import images
-from envedit.losses import metrics
-from envedit.report import manifest, output_folder, preview
-from envedit.representations.siren import fit
+from envedit.report import output_folder
 
 RESULTS = ("fit.json", "fitted.exr", "preview.png")
 """What the command leaves in its folder."""
@@ -51,6 +46,8 @@ def _run(arguments, console):
     overrides = [f"input.envmap={config.quote(arguments.map)}", *arguments.overrides]
     settings = config.loads("", Path.cwd(), "command line", arguments.preset, overrides)
     doctor.select(settings.variant)
+    from envedit import inputs
+
     original, warnings = inputs.load_map(settings.input)
     folder = Path(arguments.out or f"{Path(arguments.map).stem}_fit")
     with output_folder.results_in(folder, RESULTS, [arguments.map]):
@@ -62,6 +59,14 @@ def _run(arguments, console):
 
 def _fit(arguments, settings, original, folder, console):
     """Fit, and leave the results in a folder."""
+    import mitsuba as mi
+
+    from envedit import inputs
+    from envedit.images import images
+    from envedit.losses import metrics
+    from envedit.report import manifest, preview
+    from envedit.representations.siren import fit
+
     rows = inputs.active_rows(settings.input.rows, original.shape[0])
     active = original[rows.slice]
     network = settings.representation

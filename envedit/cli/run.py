@@ -179,7 +179,7 @@ def _keep_map(folder, stop):
     from envedit import config
     from envedit.report import map_files
 
-    map_files.write_map(config.Output(), folder / "edited", stop.envmap, stop.given)
+    map_files.write_map(config.Output(), folder / "edited", stop.envmap, stop.input_map)
 
 
 def _export_initial(settings, base, file, console):

@@ -21,8 +21,7 @@ def main(argv: list[str] | None = None) -> int:
     )
     parser.add_argument("--markdown", action="store_true", help="print the reference")
     arguments = parser.parse_args(argv)
-    from envedit.config.json_schema import json_schema
-    from envedit.config.reference import markdown
+    from envedit.config.reference import json_schema, markdown
 
     print(markdown().rstrip() if arguments.markdown else json.dumps(json_schema(), indent=1))
     return 0

@@ -1,7 +1,6 @@
 """Configuration: TOML to frozen dataclasses, with presets, checks and errors that name the key."""
 
 from envedit.config.input_schema import TARGET_KINDS
-from envedit.config.reading import from_dict, load, loads
 from envedit.config.schema import (
     Config,
     Fit,
@@ -15,7 +14,7 @@ from envedit.config.schema import (
     Scene,
     Target,
 )
-from envedit.config.toml import quote, to_toml
+from envedit.config.toml import from_dict, load, loads, quote, to_toml
 from envedit.config.unused import unused
 
 __all__ = [

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from envedit.config.light_schema import LightList
-from envedit.config.region_schema import RegionList
-from envedit.config.stroke_schema import StrokeList
+from envedit.config.list_schema import LightList, RegionList, StrokeList
 from envedit.config.tables import EDITED, LAYERS, Table, key
 from envedit.config.validators import (
     MOST_DIM,

@@ -1,18 +1,19 @@
-"""The reference of the configuration, ``docs/configuration.md``: ``envedit schema --markdown``.
+"""The configuration as JSON Schema and as the page ``docs/configuration.md``: ``envedit schema``.
 
-Written from the fields, their checks and the presets, so that it cannot differ from them; a test compares.
+Both are written from the fields, their checks and the presets.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import MISSING, Field
 from typing import Any
 
-from envedit.config import light_schema
-from envedit.config.json_schema import json_schema
+from envedit.config.list_schema import LIGHT_SIZE
 from envedit.config.presets import MANY_PARAMETERS, PAINTED, PRESETS, SIREN
 from envedit.config.schema import FIELDS, TOP, Config
 from envedit.config.toml import quote
+from envedit.config.unused import condition, conditions
 from envedit.config.validators import Schema
 
 _HEAD = """\
@@ -46,12 +47,46 @@ complete its keys and check them.
 _ENTRIES = {
     "input.lights": "A light of the map (with `light`), or one that is added; see "
     "[by hand](painting.md#move-lights). Radius of an added light where none is given: "
-    f"{light_schema.SIZE:g} degrees.",
+    f"{LIGHT_SIZE:g} degrees.",
     "input.regions": "A region has one shape: points or polygon; see [regions of the map](regions.md).",
     "target.strokes": "What each type does is said in [painting](painting.md). A stroke has one shape: "
     "points, polygon, ellipse or rectangle; temperature, contrast and blur may have none.",
 }
 """What is said above the keys of each list of tables."""
+
+
+def json_schema() -> Schema:
+    """Return the configuration as JSON Schema, draft 7, which editors know.
+
+    It accepts all that the configuration does. What depends on several keys, on the shape of a stroke or on
+    single precision is left to the run.
+    """
+    properties: Schema = {}
+    for name, top in TOP.items():
+        if name not in FIELDS:
+            properties[name] = _key(top, "")
+            continue
+        keys = {key: _key(f, condition(conditions(name, key))) for key, f in FIELDS[name].items()}
+        about = (top.metadata["table"].__doc__ or "").partition("\n\n")[0]
+        properties[name] = {"type": "object", "description": about, "properties": keys}
+        properties[name]["additionalProperties"] = False
+    return {
+        "$schema": "http://json-schema.org/draft-07/schema#",
+        "title": "Configuration of envedit",
+        "type": "object",
+        "properties": properties,
+        "additionalProperties": False,
+    }
+
+
+def _key(f: Field[Any], only: str) -> Schema:
+    """Return the schema of a key: what it may be, its meaning and unit, and its default."""
+    about, unit = f.metadata["doc"], f.metadata["unit"]
+    about = f"{about} [{unit}]" if unit else about
+    default = f.default_factory() if f.default_factory is not MISSING else f.default
+    default = list(default) if isinstance(default, tuple) else default
+    check: Schema = f.metadata["check"].schema()
+    return {**check, "description": f"{about}; {only}" if only else about, "default": default}
 
 
 def markdown() -> str:
@@ -88,10 +123,9 @@ def values(schema: Schema) -> str:
             return "; or ".join(map(values, options))
         case {"enum": names}:
             return ", ".join(f'"{name}"' for name in names)
-        case {"type": "array", "items": [*items], "minItems": least}:
-            count = len(items) if least == len(items) else f"{least} to {len(items)}"
+        case {"type": "array", "items": [*items]}:
             each = {values(item) for item in items}
-            return f"list of {count}: {each.pop()}" if len(each) == 1 else f"list of {count} numbers"
+            return f"list of {len(items)}" + (f": {each.pop()}" if len(each) == 1 else " numbers")
         case {"type": "array", "items": item}:
             inner = f"({values(item)})" if "anyOf" in item or "items" in item else values(item)
             inner += "s" * inner.isalpha()

@@ -2,7 +2,7 @@
 
 What depends on two keys at once is checked when the dataclasses are built, however they are. Whether input
 files exist is not looked at here: the modules that read them say so. The file is read in
-:mod:`envedit.config.reading`.
+:mod:`envedit.config.toml`.
 
 >>> FIELDS["fit"]["epochs"].metadata["check"], FIELDS["fit"]["epochs"].metadata["unit"]
 (Integer(low=0, high=10000000, even=False), 'steps')

@@ -54,46 +54,6 @@ class Check(ABC):
         return self.words
 
 
-class Tables(Check):
-    """A list of tables.
-
-    Calling it raises ConfigError, which names ``input.lights[2].flux``, where an entry has an unknown key or
-    an unusable value; WantedError if it is no list of tables, or too long.
-    """
-
-    words = "a list of tables"
-    name: str  # of the key, "input.lights"
-    most: int | None = None  # entries; None: any number
-
-    def __call__(self, value: Any) -> tuple[dict[str, Any], ...]:
-        if not isinstance(value, list | tuple) or not all(isinstance(v, dict) for v in value):
-            raise WantedError(str(self))
-        if self.most is not None and len(value) > self.most:
-            raise WantedError(f"at most {self.most} {self.name.split('.')[1]}")
-        return tuple(self._entry(f"{self.name}[{i}]", v) for i, v in enumerate(value))
-
-    @abstractmethod
-    def _entry(self, name: str, table: dict[str, Any]) -> dict[str, Any]: ...
-
-    def _checked(self, name: str, table: dict[str, Any], keys: dict[str, Check]) -> dict[str, Any]:
-        """Return the values of an entry, in the order of the keys that it may have."""
-        for unknown in (key for key in table if key not in keys):
-            raise ConfigError(f"{name}: has no key {show(unknown)}; {meant(unknown, keys)}")
-        return {key: named(f"{name}.{key}", check, table[key]) for key, check in keys.items() if key in table}
-
-    def _require(self, name: str, key: str, found: dict[str, Any], needed: bool, where: str) -> None:
-        """Raise ConfigError where a key of an entry is missing, or is given without a meaning."""
-        if needed and key not in found:
-            raise ConfigError(f"{name}.{key}: got none, expected one {where}")
-        if not needed and key in found:
-            raise ConfigError(f"{name}.{key}: got {show(found[key])}, expected none but {where}")
-
-    def _schema_of(self, table: Schema) -> Schema:
-        """Return that of the list, given what entries have beside being tables of these properties."""
-        entry = {"type": "object", **table, "additionalProperties": False}
-        return {"type": "array", "items": entry} | ({} if self.most is None else {"maxItems": self.most})
-
-
 # ---- words -------------------------------------------------------------------------------------------------
 
 
@@ -234,36 +194,6 @@ class Numbers(Check):
         return {"type": "array", "items": items, "minItems": len(items), "maxItems": len(items)}
 
 
-@dataclass(frozen=True)
-class Points(Check):
-    """A list of points, each a list of two numbers; ``most`` of None: any number of them."""
-
-    point: Numbers
-    names: str  # of the two numbers
-    least: int
-    most: int | None = None
-
-    def __call__(self, value: Any) -> list[list[float]]:
-        most = math.inf if self.most is None else self.most
-        if not isinstance(value, list | tuple) or not self.least <= len(value) <= most:
-            raise WantedError(str(self))
-        points = []
-        for i, place in enumerate(value):
-            try:
-                points.append(self.point(place))
-            except WantedError as error:
-                raise WantedError(f"{error} at point {i}") from None
-        return points
-
-    def __str__(self) -> str:
-        count = f"at least {self.least}" if self.most is None else f"{self.least} to {self.most}"
-        return f"[[{self.names}], ...], {count}"
-
-    def schema(self) -> Schema:
-        points: Schema = {"type": "array", "items": self.point.schema(), "minItems": self.least}
-        return points if self.most is None else points | {"maxItems": self.most}
-
-
 class Pair(Numbers):
     """Two values of one check, as a tuple."""
 
@@ -278,26 +208,40 @@ class Pair(Numbers):
 
 
 class ListOf(Check):
-    """A list of what another check accepts, as a tuple."""
+    """A list of what another check accepts, as a tuple; ``most`` of None: any number of it."""
 
-    words = "a list"
-
-    def __init__(self, check: Check, least: int = 0, unique: bool = False) -> None:
+    def __init__(
+        self,
+        check: Check,
+        least: int = 0,
+        most: int | None = None,
+        unique: bool = False,
+        words: str = "a list",
+    ) -> None:
         self.check = check
         self.least = least
+        self.most = most
         self.unique = unique
+        self.words = words
 
     def __call__(self, value: Any) -> tuple[Any, ...]:
-        if not isinstance(value, list | tuple) or len(value) < self.least:
+        most = math.inf if self.most is None else self.most
+        if not isinstance(value, list | tuple) or not self.least <= len(value) <= most:
             raise WantedError(self.words)
-        values = tuple(self.check(v) for v in value)
+        values = []
+        for i, entry in enumerate(value):
+            try:
+                values.append(self.check(entry))
+            except WantedError as error:
+                raise WantedError(f"{error} at entry {i}") from None
         if self.unique and len({*values}) < len(values):
             raise WantedError(self.words)
-        return values
+        return tuple(values)
 
     def schema(self) -> Schema:
-        values: Schema = {"type": "array", "items": self.check.schema()}
-        return values | ({"minItems": self.least} if self.least else {}) | {"uniqueItems": self.unique}
+        values: Schema = {"type": "array", "items": self.check.schema(), "uniqueItems": self.unique}
+        values |= {"minItems": self.least} if self.least else {}
+        return values if self.most is None else values | {"maxItems": self.most}
 
 
 class Either(Check):
@@ -370,22 +314,12 @@ class Parameters(Check):
     """A flat table of strings, numbers and booleans."""
 
     words = "a table of strings, numbers and booleans"
+    scalar = Either(words, Boolean(), String(), Integer(-(2**63), 2**63 - 1), Number(-math.inf))
 
     def __call__(self, value: Any) -> dict[str, str | float | bool]:
         if not isinstance(value, dict):
-            raise WantedError(str(self))
-        return {String()(name): self._scalar(scalar) for name, scalar in value.items()}
-
-    def _scalar(self, value: Any) -> str | float | bool:
-        if isinstance(value, bool):
-            return value
-        if isinstance(value, str):
-            return String()(value)
-        if isinstance(value, Integral):
-            return Integer(-(2**63), 2**63 - 1)(value)
-        if isinstance(value, Real):
-            return Number(-math.inf)(value)
-        raise WantedError(str(self))
+            raise WantedError(self.words)
+        return {String()(name): self.scalar(scalar) for name, scalar in value.items()}
 
     def schema(self) -> Schema:
         return {"type": "object", "additionalProperties": {"type": ["string", "number", "boolean"]}}

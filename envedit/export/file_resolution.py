@@ -42,15 +42,15 @@ def at_full_resolution(result: results.Result) -> np.ndarray | None:
     InputError or NumericalError if the file cannot be read any more, or the carried map is not finite.
     """
     settings = result.settings
-    if result.given.size[0] <= settings.input.width:
+    if result.input_map.size[0] <= settings.input.width:
         return None
-    own = result.given.at_file_size(settings.input)
+    own = result.input_map.at_file_size(settings.input)
     if result.found is None:
-        full = _by_hand(settings.input, result.given, own)
+        full = _by_hand(settings.input, result.input_map, own)
         edited = full.radiance
         turn_degrees = 0.0
     else:
-        full, edited = carried(settings.input, result.given, own, result.found, result.maps["initial"])
+        full, edited = carried(settings.input, result.input_map, own, result.found, result.maps["initial"])
         turn_degrees = result.found.turn_degrees
     adjusted, _ = adjustments.adjust(edited, settings.lights, settings.output, own.scale)
     return full.as_stored(adjusted, turn_degrees)

@@ -7,6 +7,7 @@ by where they are and how much flux they have, beginning with where an edit is k
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -244,30 +245,21 @@ def _place(light):
 def _paired(cost):
     """Return for each row the column that it is paired with, or None, by the least sum of costs.
 
-    The Hungarian method with potentials (Kuhn 1955; Jonker and Volgenant 1987), with a column for every row
-    that stands for none.
+    By dynamic programming over the sets of columns taken: a map has at most eight lights.
     """
     rows, columns = cost.shape
-    table = np.hstack([np.minimum(cost, 1e6), np.full((rows, rows), FARTHEST)])
-    u, v = np.zeros(rows + 1), np.zeros(columns + rows + 1)
-    row_of = np.zeros(columns + rows + 1, int)  # 0: none; column 0 is where a search begins
-    for i in range(1, rows + 1):
-        row_of[0] = i
-        column = 0
-        least = np.full(len(v), np.inf)
-        back = np.zeros(len(v), int)
-        done = np.zeros(len(v), bool)
-        while row_of[column]:
-            done[column] = True
-            here = row_of[column]
-            reduced = np.append(np.inf, table[here - 1]) - u[here] - v
-            closer = ~done & (reduced < least)
-            least[closer], back[closer] = reduced[closer], column
-            column = int(np.argmin(np.where(done, np.inf, least)))
-            step = least[column]
-            u[row_of[done]] += step
-            v[done] -= step
-            least[~done] -= step
-        while column:
-            row_of[column], column = row_of[back[column]], back[column]
-    return [next((j for j in range(columns) if row_of[j + 1] == i + 1), None) for i in range(rows)]
+
+    @functools.cache
+    def cheapest(row, taken):
+        """Return the least sum for this row and those after it, and their columns."""
+        if row == rows:
+            return 0.0, ()
+        rest, partners = cheapest(row + 1, taken)
+        best = FARTHEST + rest, (None, *partners)
+        for j in range(columns):
+            if j not in taken:
+                rest, partners = cheapest(row + 1, taken | {j})
+                best = min(best, (cost[row, j] + rest, (j, *partners)), key=lambda pairing: pairing[0])
+        return best
+
+    return list(cheapest(0, frozenset())[1])

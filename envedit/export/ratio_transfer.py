@@ -12,7 +12,7 @@ value as their mean. Then the ratio is corrected until the means agree, at last 
 Every source texel that overlaps an unchanged working texel has the bits of the source. The mean of every
 changed one (:func:`.latlong.resize` of the result) differs from W by at most 1 % of the brightest of it and
 its neighbours, if the source is at least four times as wide; one that touches an unchanged texel cannot be
-darkened where a source texel lies in both. A source that is not larger takes W, resized, where it changed.
+darkened where a source texel lies in both. The source is larger than the working map.
 """
 
 from __future__ import annotations
@@ -46,14 +46,7 @@ class Ratio:
         self.changed = (np.asarray(original)[rows] != np.asarray(edited)[rows]).any(axis=2)
         if free is not None:
             self.changed &= free
-        height, width = grid.shape
-        whole = np.shape(edited)[:2]
-        self.same_size = height <= whole[0] or width <= whole[1]
-        self._overlaps(whole)
-        if self.same_size:
-            target = np.asarray(edited) if grid.shape == whole else latlong.resize(edited, height, width)
-            self.target = np.asarray(target, np.float32)
-            return
+        self._overlaps(np.shape(edited)[:2])
         with np.errstate(divide="ignore", over="ignore"):
             ratio = np.where(
                 self.old > 0, self.want / np.maximum(self.old, 1e-30), 1 + 1e30 * (self.want > 0)
@@ -85,7 +78,7 @@ class Ratio:
 
     def correct(self, source: np.ndarray) -> None:
         """Correct m and a until the means of the changed working texels are the edited map's."""
-        if self.same_size or not self.changed.any():
+        if not self.changed.any():
             return
         least = LEAST * float(self.want.mean())
         for step in range(sum(ROUNDS)):
@@ -123,8 +116,6 @@ class Ratio:
         changed = changed[:, self.columns[0]] & changed[:, self.columns[1]]
         if not changed.any():
             return source
-        if self.same_size:
-            return np.where(changed[..., None], self.target[band.rows], source)
 
         # ---- Texels times m; where that is no moderate factor, replaced or added to
         grid = self.grid

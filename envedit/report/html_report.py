@@ -59,7 +59,7 @@ def write_report(path: FilePath, result: Result, manifest: dict) -> None:
     by_view = _by_view(renders, result.views)
 
     warnings = result.warnings
-    source = result.given.source if result.given else settings.input.envmap
+    source = result.input_map.source if result.input_map else settings.input.envmap
     title = escape(f"{Path(source).stem}, {Path(settings.scene.file).stem}")
     manifest_text = json.dumps(plain(manifest, "", []), indent=1, ensure_ascii=False)
 

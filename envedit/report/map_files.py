@@ -41,9 +41,9 @@ def write_map(
 
 def write_lights(folder: Path, result: results.Result) -> None:
     """Write ``edited_sky.exr``, ``edited_lights.exr`` and ``lights.json``."""
-    source = {"source": result.given.source}
-    space = result.given.chromaticities
-    sky, lights = light_list.split(result.envmap, result.given.as_stored(result.core))
+    source = {"source": result.input_map.source}
+    space = result.input_map.chromaticities
+    sky, lights = light_list.split(result.envmap, result.input_map.as_stored(result.core))
     images.write_exr(folder / "edited_sky.exr", sky, source, chromaticities=space)
     images.write_exr(folder / "edited_lights.exr", lights, source, chromaticities=space)
     manifest.write_json(folder / "lights.json", result.lights)
@@ -72,7 +72,9 @@ def write_scene(folder: Path, result: results.Result) -> list[str]:
         below = None
         if conversion.is_usd(chosen.file):
             below = os.path.relpath(chosen.file, folder), conversion.kept(chosen.file).stage
-        stage = usd_scene.text(edited, "edited_sky.exr", lights, result.to_world, result.given.scale, below)
+        stage = usd_scene.text(
+            edited, "edited_sky.exr", lights, result.to_world, result.input_map.scale, below
+        )
         atomic_files.write_atomically(folder / "edited.usda", stage.encode())
         text = scene.relit(chosen.file, edited, dict(chosen.parameters), result.base, chosen.up, chosen.scale)
     except InputError as error:  # the scene's files may be gone by now

@@ -74,21 +74,19 @@ def write(folder: Path, result: results.Result, import_s: float) -> list[str]:
 
 
 def write_given(
-    settings: config.Config, folder: Path, memory: inputs.Given | None, warnings: list[str]
+    settings: config.Config, folder: Path, replacements: inputs.Replacements, warnings: list[str]
 ) -> config.Config:
     """Write the arrays that a run was given, and return the configuration that names their files.
 
     A scene that has no file is named in a warning.
     """
-    memory = memory or inputs.Given()
-    if memory.scene is not None and memory.scene.path is None:
+    if replacements.scene is not None and replacements.scene.path is None:
         warnings.append(
             "config.toml: the scene was given as an object: name a file in [scene] file to run it again; "
             "edited.xml is not written"
         )
         settings = replace(settings, output=replace(settings.output, scene=False))
-    arrays = {"envmap": memory.envmap, "target_map": memory.target_map}
-    arrays |= {"target": memory.picture, "mask": memory.mask}
+    arrays = {name: getattr(replacements, name) for name in ("envmap", "target_map", "target", "mask")}
     files = {name: folder / f"given_{name}.exr" for name, array in arrays.items() if array is not None}
     for name, file in files.items():
         array = np.asarray(arrays[name], np.float32)
@@ -106,7 +104,11 @@ def write_given(
 def _inputs(result):
     """Return the files that a run has read, by what they are to it; several of a kind are numbered."""
     settings = result.settings
-    paths = {"envmap": result.given.source, "scene": result.scene or "", "start": settings.optimizer.start}
+    paths = {
+        "envmap": result.input_map.source,
+        "scene": result.scene or "",
+        "start": settings.optimizer.start,
+    }
     for role, files in (("target", settings.target.files), ("mask", settings.target.masks)):
         paths |= {role if len(files) == 1 else f"{role} {i}": file for i, file in enumerate(files)}
     paths |= installed.files(settings)
@@ -115,7 +117,7 @@ def _inputs(result):
 
 def _write_maps(folder, result):
     """Write the edited map, its layers, its other explanations, and what the target determines of it."""
-    input_map = result.given
+    input_map = result.input_map
     output = result.settings.output
     result.warnings += map_files.write_map(output, folder / "edited", result.envmap, input_map)
     layers = {
@@ -157,11 +159,11 @@ def _write_full_resolution(folder, result):
         full = file_resolution.at_full_resolution(result)
         if full is not None:
             result.warnings += map_files.write_map(
-                result.settings.output, folder / "edited_full", full, result.given
+                result.settings.output, folder / "edited_full", full, result.input_map
             )
     except MemoryError:
         result.warnings.append(
-            f"{result.given.source}: not enough memory to carry the edit to its size; "
+            f"{result.input_map.source}: not enough memory to carry the edit to its size; "
             "edited.exr has it at working resolution"
         )
     except (InputError, NumericalError) as error:  # the file may be gone by now

@@ -13,7 +13,6 @@ import re
 import uuid
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
@@ -22,6 +21,7 @@ import numpy as np
 from envedit import config
 from envedit.core import latlong, rotations
 from envedit.core.errors import ConfigError, InputError
+from envedit.core.types import FilePath
 from envedit.scene import scene as scenes
 from envedit.scene.scene import Scene
 from envedit.scene.supported import ROULETTE, Integrator, OwnMap
@@ -43,7 +43,7 @@ _ROUNDING = 1e-4  # of a rotation's columns
 _ANY_DEPTH = 2**32 - 1  # as Mitsuba prints a depth of -1
 
 
-def load(scene: object, settings: config.Scene, base: Path | None = None) -> Scene:
+def load(scene: object, settings: config.Scene, base: FilePath | None = None) -> Scene:
     """Take a scene in any form; of ``settings`` all but ``file`` counts.
 
     ``scene`` is a file, the name of a shipped scene, a mapping as ``mi.load_dict`` takes it, a Scene, which
@@ -135,9 +135,7 @@ def wrapped(scene: Any, sensors: str | Sequence[int | str] = "all") -> Scene:
         params=params,
         views=views,
         own=OwnMap(None, scale),
-        max_depth=integrator.max_depth,
-        rr_depth=integrator.rr_depth,
-        hide_emitters=integrator.hide_emitters,
+        integrator=integrator,
         notes=integrator.notes,
     )
 

@@ -54,12 +54,13 @@ class PathTracer:
                 f"renderer.spp: {self.spp} samples of {scene.width}x{scene.height} pixels are more than one "
                 f"rendering can hold, {_MOST_SAMPLES}: lower [renderer] spp or [scene] width"
             )
-        most = AUTO_DEPTH if scene.max_depth < 0 else min(AUTO_DEPTH, scene.max_depth)
+        own = scene.integrator
+        most = AUTO_DEPTH if own.max_depth < 0 else min(AUTO_DEPTH, own.max_depth)
         self.depth = most if isinstance(max_depth, str) else max_depth
         self.seed = seed
         self.choices = [f"path tracing: {self.spp} samples a pixel, path depth {self.depth}"]
         installed_plugins.come_first()
-        options = {"max_depth": self.depth, "rr_depth": self.depth + 1, "hide_emitters": scene.hide_emitters}
+        options = {"max_depth": self.depth, "rr_depth": self.depth + 1, "hide_emitters": own.hide_emitters}
         self._integrators = [mi.load_dict({"type": kind, **options}) for kind in ("path", "prb")]
         self._index: mi.UInt32 | None = None
 

@@ -150,7 +150,7 @@ def _followed(scene, view, x, y):
     for bounce in range(HIGHLIGHT_BOUNCES + 1):
         # ---- The next surface, or none: what the camera sees beside all surfaces may be hidden
         si = scene.mi.ray_intersect(ray, active)
-        if bounce or not scene.hide_emitters:
+        if bounce or not scene.integrator.hide_emitters:
             leaves |= (active & ~si.is_valid()).numpy()
         active &= si.is_valid()
 

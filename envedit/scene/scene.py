@@ -26,7 +26,7 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -89,12 +89,8 @@ class Scene:
         ``mi.traverse`` of the scene.
     own : supported.OwnMap
         File and scale of the map that the scene itself names.
-    max_depth : int
-        Longest path in segments that the scene's integrator asks for, as Mitsuba counts them; -1: any.
-    rr_depth : int
-        Path length in segments from which on Russian roulette ends paths.
-    hide_emitters : bool
-        The camera sees neither the environment nor shapes that are lamps.
+    integrator : supported.Integrator
+        What the scene's integrator asks for.
     notes : tuple of str
         What of the file is not used, or used otherwise.
     parameters : dict
@@ -116,9 +112,7 @@ class Scene:
     params: mi.SceneParameters
     views: tuple[View, ...]
     own: supported.OwnMap = supported.OwnMap(None, 1.0)
-    max_depth: int = -1
-    rr_depth: int = supported.ROULETTE
-    hide_emitters: bool = False
+    integrator: supported.Integrator = supported.Integrator()
     notes: tuple[str, ...] = ()
     parameters: dict[str, str | float | bool] = field(default_factory=dict)
     again: Callable[[int, int], Scene] | None = None
@@ -127,7 +121,7 @@ class Scene:
     @functools.cached_property
     def alpha(self) -> np.ndarray | None:
         """Share of each pixel that sees a surface, (h, w) float32; None unless emitters are hidden."""
-        if not self.hide_emitters:
+        if not self.integrator.hide_emitters:
             return None
         self.set_envmap(np.zeros((4, 8, 3), np.float32))
         picture = self._pass(min(_ALPHA_SPP, self._pass_samples()), 0, 0, 2)
@@ -179,7 +173,7 @@ class Scene:
         """
         spp = _whole("spp", spp, 1)
         seed = _whole("seed", seed, 0)
-        max_depth = self.max_depth if max_depth is None else _whole("max_depth", max_depth, -1)
+        max_depth = self.integrator.max_depth if max_depth is None else _whole("max_depth", max_depth, -1)
         self.set_envmap(image)
         most = self._pass_samples()
         counts = [most] * (spp // most) + ([spp % most] if spp % most else [])
@@ -210,7 +204,7 @@ class Scene:
         total: Any = 0.0  # then arrays
         shown, power = total, total
         for i in range(QUIET_MOST // count):
-            picture = self._pass(count, seed, i, self.max_depth)[..., :3]
+            picture = self._pass(count, seed, i, self.integrator.max_depth)[..., :3]
             display = tonemap(picture)
             total, shown, power = total + picture, shown + display, power + display**2
             n = i + 1
@@ -228,7 +222,8 @@ class Scene:
     def _pass(self, count, seed, i, max_depth):
         """Render one pass of every view with alpha, (h, w, 4) float64."""
         installed_plugins.come_first()
-        options = {"max_depth": max_depth, "rr_depth": self.rr_depth, "hide_emitters": self.hide_emitters}
+        own = self.integrator
+        options = {"max_depth": max_depth, "rr_depth": own.rr_depth, "hide_emitters": own.hide_emitters}
         integrator = mi.load_dict({"type": "path", **options})
         pictures = []
         for k in range(len(self.views)):
@@ -280,7 +275,8 @@ def load(
 
     # ---- Parse
     width, height = _whole("width", width or 0, 0), _whole("height", height or 0, 0)
-    config, state, path, where, folders = _parsed(file, parameters, base)
+    parsed = _parsed(file, parameters, base)
+    state, where, folders = parsed.state, parsed.where, parsed.folders
 
     # ---- What is read of emitter, integrator and sensors
     own = supported.own_map(state, where, folders, scale)
@@ -296,8 +292,14 @@ def load(
     _change_nodes(state, where, folders)
 
     # ---- Notes, files and digest
-    first = usd.kept(path).notes if path is not None and usd.is_usd(path) else ()
-    notes = (*first, *own.notes, *turned, *integrator.notes, *supported.polarised(state), *sensor_notes)
+    notes = (
+        *parsed.notes,
+        *own.notes,
+        *turned,
+        *integrator.notes,
+        *supported.polarised(state),
+        *sensor_notes,
+    )
     read = [node.props["filename"] for node in state.nodes if "filename" in node.props]
     read += [] if own.file is None else [str(own.file)]
     digest = hashlib.sha256(b"envedit scene 1")
@@ -316,7 +318,7 @@ def load(
     # ---- Build
     # On one thread Mitsuba waits for ever for an EXR texture; libjpeg prints about odd textures.
     with film.threads(max(2, dr.thread_count())), quiet_libraries():
-        scene = parser.instantiated(config, state, where)
+        scene = parser.instantiated(parsed.config, state, where)
     if scene.environment() is None or scene.environment().id() != name:
         raise InputError(f"{where}: a ready-made environment emitter cannot be replaced; give its dict")
     params = mi.traverse(scene)
@@ -329,7 +331,7 @@ def load(
 
     return Scene(
         scene,
-        path,
+        parsed.path,
         columns,
         views[-1].rows.stop,
         key,
@@ -338,9 +340,7 @@ def load(
         params,
         views,
         own=own,
-        max_depth=integrator.max_depth,
-        rr_depth=integrator.rr_depth,
-        hide_emitters=integrator.hide_emitters,
+        integrator=integrator,
         notes=notes,
         parameters=dict(parameters or {}),
         again=again,
@@ -384,12 +384,24 @@ def views_of(scene: mi.Scene, names: Sequence[str]) -> tuple[int, tuple[View, ..
     return sizes[0][0], tuple(views)
 
 
+class _Parsed(NamedTuple):
+    """A scene as Mitsuba's parser has it."""
+
+    config: mi.parser.ParserConfig
+    state: mi.parser.ParserState
+    path: Path | None  # its file; None: a dict
+    where: str  # what errors call it
+    folders: tuple[Path, ...]  # where the files lie that it names
+    notes: tuple[str, ...]  # what of a USD file is not used
+
+
 def _parsed(file, parameters, base):
-    """Parse a scene; returns Mitsuba's configuration and state, the file, its name and where files lie."""
+    """Parse a scene; a USD file becomes a Mitsuba scene first."""
     config = mi.parser.ParserConfig(mi.variant())
     config.merge_meshes = False  # shapes keep their names
     config.unused_parameters = mi.LogLevel.Debug  # checked here, with the nearest name
     base = Path(base or ".").absolute()
+    notes: tuple[str, ...] = ()
     if isinstance(file, dict):
         if parameters:
             raise ConfigError("scene.parameters: a scene given as a dict has no $names to fill")
@@ -401,8 +413,11 @@ def _parsed(file, parameters, base):
         state = parser.called(where, mi.parser.parse_dict, config, file)
     else:
         path = find(file)
-        text = usd.kept(path).xml if usd.is_usd(path) else path
-        filled, outline = _check_parameters(text, parameters or {})
+        text = path
+        if usd.is_usd(path):
+            text, notes = usd.kept(path)[:2]
+        filled = _as_text(parameters or {})
+        outline = _outline(text, filled)
         where, folders = str(path), (text.parent, base, *outline.folders)
         if wrong := scene_files.errors([SceneFile("spectrum", file) for file in outline.spectra]):
             raise wrong[0]
@@ -413,7 +428,7 @@ def _parsed(file, parameters, base):
     installed_plugins.come_first()
     for node in state.nodes:
         parser.check_plugin(state, node, where)
-    return config, state, path, where, folders
+    return _Parsed(config, state, path, where, folders, notes)
 
 
 def relit(
@@ -431,7 +446,8 @@ def relit(
     emitter becomes an ``envmap`` of the file ``envmap``, as it shall stand in the XML, with the rotation and
     ``scale`` of :func:`load`, or one is added; a scene without an integrator gets ``path``.
     """
-    _, state, _, where, folders = _parsed(file, parameters, base)
+    parsed = _parsed(file, parameters, base)
+    state, where, folders = parsed.state, parsed.where, parsed.folders
     own = supported.own_map(state, where, folders, scale)
     emitter, _, _ = parser.replace_environment(state, where, up)
     _change_nodes(state, where, folders)
@@ -474,16 +490,21 @@ def files(file: FilePath, parameters: Mapping[str, object], base: FilePath | Non
         if usd.is_usd(path):
             converted = usd.kept(path)
             text, sources = converted.xml, converted.sources
-        outline = scene_text.read(text, {name: str(value) for name, value in parameters.items()})
+        outline = scene_text.read(text, _as_text(parameters))
     except EnveditError:
         return [path]
     folders = text.parent, Path(base or ".").absolute(), *outline.folders
     return [path, *map(Path, sources), *(folder / name for name in outline.files for folder in folders)]
 
 
-def _check_parameters(path: Path, parameters: dict) -> tuple[dict[str, str], scene_text.Outline]:
-    """Return the parameters as text, after comparing their names with the ``$names`` of the XML; and this."""
-    outline = scene_text.read(path, {str(name): str(value) for name, value in parameters.items()})
+def _as_text(parameters: Mapping[str, object]) -> dict[str, str]:
+    """Return the values of parameters as they stand in XML."""
+    return {k: str(v).lower() if isinstance(v, bool) else str(v) for k, v in parameters.items()}
+
+
+def _outline(path: Path, parameters: dict[str, str]) -> scene_text.Outline:
+    """Read a scene's XML, and compare the names of parameters with its ``$names``."""
+    outline = scene_text.read(path, parameters)
     used, defaults = outline.used, outline.defaults
     for name in parameters:
         if name not in used | defaults:
@@ -496,10 +517,7 @@ def _check_parameters(path: Path, parameters: dict) -> tuple[dict[str, str], sce
             f"scene.parameters: {path.name} needs {', '.join(missing)}, which has no default; give it: "
             + " ".join(f"--set scene.parameters.{name}=VALUE" for name in missing)
         )
-    filled = {}
-    for name, value in parameters.items():
-        filled[name] = str(value).lower() if isinstance(value, bool) else str(value)
-    return filled, outline
+    return outline
 
 
 def _whole(name: str, value: Any, low: int) -> int:

@@ -114,12 +114,12 @@ def own_map(
 
 @dataclass(frozen=True)
 class Integrator:
-    """What the scene's integrator asks of a rendering; attributes as of :class:`.scene.Scene`."""
+    """What the scene's integrator asks of a rendering."""
 
-    max_depth: int
-    rr_depth: int
-    hide_emitters: bool
-    notes: tuple[str, ...]
+    max_depth: int = -1  # longest path in segments, as Mitsuba counts them; -1: any
+    rr_depth: int = ROULETTE  # path length in segments from which on Russian roulette ends paths
+    hide_emitters: bool = False  # the camera sees neither the environment nor shapes that are lamps
+    notes: tuple[str, ...] = ()  # what is used otherwise
 
 
 def take_integrator(state: mi.parser.ParserState, where: str) -> Integrator:

@@ -28,10 +28,10 @@ from envedit.transport.light_transport import LightTransport
 class Interrupted(Exception):
     """Ctrl-C during the edit; ``envmap`` is the map so far, that of the checkpoint where there is one.
 
-    ``given`` is the input map in whose units ``envmap`` is, once the run has brought it there.
+    ``input_map`` is the input map in whose units ``envmap`` is, once the run has brought it there.
     """
 
-    given: Any
+    input_map: Any
 
     def __init__(self, envmap: np.ndarray, step: int):
         super().__init__(f"interrupted at iteration {step}")
@@ -39,9 +39,9 @@ class Interrupted(Exception):
 
 
 class Stopped(NumericalError):
-    """The optimisation could not go on; ``envmap`` is the last good map, ``given`` as of Interrupted."""
+    """The optimisation could not go on; ``envmap`` is the last good map, ``input_map`` as of Interrupted."""
 
-    given: Any
+    input_map: Any
 
     def __init__(self, message: str, envmap: np.ndarray):
         super().__init__(message)

@@ -181,9 +181,7 @@ class Progress:
         self._total = total
         self._stream = stream
         self._begun = time.monotonic()
-        self._ended = 0
-        self._carried_out = 0  # of those that ended: not those that were done before
-        self._failed = 0
+        self._states: list[str] = []  # of the jobs that have ended
         self._said: set[str] = set()
 
     def report(self, outcome: Outcome, out: Path) -> None:
@@ -191,21 +189,21 @@ class Progress:
         if outcome.state == "lost":  # and so is all the rest
             self.say_once(f"{outcome.error}: run again to complete the table")
             return
-        self._ended += 1
-        line = f"[{self._ended}/{self._total}] {outcome.job.name}: {outcome.state}"
+        self._states.append(outcome.state)
+        ended, failed = len(self._states), self._states.count("failed")
+        carried_out = self._states.count("done") + failed  # the others were done before
+        line = f"[{ended}/{self._total}] {outcome.job.name}: {outcome.state}"
         if outcome.state in ("done", "failed"):
-            self._carried_out += 1
             line += f", {outcome.seconds:.0f} s"
         if outcome.error:
             line += f": {outcome.error}"
         if outcome.state == "failed":
-            self._failed += 1
             line += f" ({outcome.job.folder(out) / LOG})"
-        remarks = [f"{self._failed} failed"] if self._failed else []
-        if self._carried_out and self._ended < self._total:
-            left = (self._total - self._ended) * (time.monotonic() - self._begun) / self._carried_out
+        remarks = [f"{failed} failed"] if failed else []
+        if carried_out and ended < self._total:
+            left = round((self._total - ended) * (time.monotonic() - self._begun) / carried_out)
             until = time.strftime("%H:%M", time.localtime(time.time() + left))
-            remarks.append(f"about {datetime.timedelta(seconds=round(left))} left, until {until}")
+            remarks.append(f"about {datetime.timedelta(seconds=left)} left, until {until}")
         self.say(f"{line}; {', '.join(remarks)}" if remarks else line)
 
     def say(self, line: str) -> None:

@@ -23,7 +23,7 @@ def coverage(stroke: dict, height: int, width: int) -> np.ndarray:
     With d the signed distance to the shape's edge, negative inside, and s its softness, coverage is the
     smooth step u^2 (3 - 2u) of u = clip(1/2 - d / s, 0, 1): the same share of the picture at any resolution.
     Pixels at an edge narrower than eight pixels are the mean over 8 x 8 places. The stroke has every key, as
-    :mod:`envedit.config.stroke_schema` completes it.
+    :mod:`envedit.config.list_schema` completes it.
     """
     covered = np.zeros((height, width))
     across, down = (width, height) if stroke["units"] == "fraction" else (1, 1)

@@ -1,7 +1,7 @@
 """Strokes: what an artist paints on a rendering, written down as numbers.
 
 A stroke is a dict with a ``type``, a shape (:mod:`.stroke_shapes`; none is the whole image) and what belongs
-to the type; the keys, their defaults and ranges are :data:`.stroke_schema.STROKES`.
+to the type; the keys, their defaults and ranges are :data:`.list_schema.STROKES`.
 
 With E linear radiance, c coverage times opacity, t = D(E) display values:
 
@@ -29,7 +29,7 @@ from typing import Any
 
 import numpy as np
 
-from envedit.config.stroke_schema import StrokeList
+from envedit.config.list_schema import StrokeList
 from envedit.core.color import inverse_tonemap, luminance, tonemap
 from envedit.targets.stroke_shapes import coverage
 

@@ -107,30 +107,27 @@ def make(
     settings: config.Config,
     scene: Scene,
     envmap: np.ndarray,
-    picture: np.ndarray | None = None,
-    mask: np.ndarray | None = None,
-    other: np.ndarray | None = None,
+    replacements: inputs.Replacements = inputs.NO_REPLACEMENTS,
 ) -> Target:
     """Make the target of a configuration.
 
     ``envmap`` (H, W, 3) is the map that will be edited; turned by ``rotate_degrees`` where the target names
-    no file. In place of what the configuration names may be given: a painted ``picture`` (h, w, 3), linear
-    radiance, and how much each pixel of it was painted, ``mask`` (h, w), in [0, 1], by default found by
-    comparison; or the ``other`` map (H, 2 H, 3) to render under, in the units of a file.
+    no file. Of ``replacements`` the target, its mask and its map take the place of files.
 
     InputError if a file cannot be read, a picture does not fit the film, or the other map is brighter than
     :data:`.radiance.BRIGHTEST`; a picture that is so bright is cut there, with a warning. ConfigError if a
     view is not the scene's, or is given twice, or strokes paint nothing; as of :func:`.extensions.load`.
     """
     hidden = hidden_pixels(scene)
-    made = _made(settings, scene, envmap, picture, mask, other, hidden)
+    made = _made(settings, scene, envmap, replacements, hidden)
     return _seen(made, hidden, settings.output.tonemap)
 
 
-def _made(settings, scene, envmap, picture, mask, other, hidden):
+def _made(settings, scene, envmap, replacements, hidden):
     """Make the target, without regard to pixels that see no surface where nothing was painted."""
     # ---- The scene under another map
     chosen = settings.target
+    picture, mask, other = replacements.target, replacements.mask, replacements.target_map
     if picture is None and chosen.kind == "envmap":
         if other is not None or not chosen.file or images.is_panorama(str(chosen.file)):
             return _rendered(settings, scene, envmap, other)

@@ -131,8 +131,8 @@ def choose(
     """
     # ---- Path depth and samples
     by_row, by_bounce = light[0], light[1].copy()
-    if scene.max_depth > 0:
-        by_bounce[scene.max_depth :] = 0
+    if scene.integrator.max_depth > 0:
+        by_bounce[scene.integrator.max_depth :] = 0
     bounces, choices = choose_bounces(scene, max_depth, by_bounce)
     samples, capacity, choice = choose_samples(scene, spp, shape[0] * shape[1], memory_gb)
     depth_error = left_out(by_bounce, bounces)
@@ -147,7 +147,7 @@ def choose(
     # ---- What memory is left holds the camera paths of exact columns
     left = memory_gb - gigabytes(scene.width * scene.height, samples, capacity)
     # The light of other lamps is constant: it need not be cut where no path depth is asked for.
-    most = scene.max_depth if max_depth == "auto" else bounces + 1
+    most = scene.integrator.max_depth if max_depth == "auto" else bounces + 1
     return SamplingPlan(
         spp=samples,
         bounces=bounces,

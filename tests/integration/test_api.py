@@ -85,7 +85,7 @@ def test_a_picture_is_paint_or_a_rendering_and_what_is_saved_runs_to_the_same_ma
     assert found.scene.parameters == {"roughness": 0.4}
     assert found.target.kind == kind and found.target.spp == 8
     again = pipeline.run(found)
-    assert np.array_equal(again.envmap, result.envmap) and again.given.size == (32, 16)
+    assert np.array_equal(again.envmap, result.envmap) and again.input_map.size == (32, 16)
     before = result.metrics["timing"]["total_s"], list(result.warnings)
     result.save(tmp_path / "out")  # a second time: the first is moved aside, and the result is as it was
     assert (tmp_path / "out" / "earlier-1" / "given_envmap.exr").exists()
@@ -111,7 +111,7 @@ def test_a_built_scene_is_edited_and_has_its_own_map_again(tmp_path):
     assert np.array_equal(built_scene.own_map(scene), own)
     assert float(np.array(mi.traverse(scene)["sky.scale"]).item()) == 2
     # The map is in the units of the scene's own, which scale multiplies.
-    assert np.array_equal(result.given.stored, own) and np.array_equal(result.maps["initial"], 2 * own)
+    assert np.array_equal(result.input_map.stored, own) and np.array_equal(result.maps["initial"], 2 * own)
     assert np.allclose(result.maps["target"], 2 * other) and result.render.shape == (8, 12, 3)
     warned = result.save(tmp_path / "out")
     assert any("the scene was given as an object" in line for line in warned)
@@ -124,7 +124,8 @@ def test_a_built_scene_renders_as_the_same_scene_from_a_dict():
     own = np.random.default_rng(3).uniform(0.1, 2, (8, 16, 3)).astype(np.float32)
     built, parsed = envedit.load_scene(mi.load_dict(ball(own))), envedit.load_scene(ball(own), 12, 8)
     for scene in (built, parsed):
-        assert (scene.width, scene.height, scene.max_depth, scene.hide_emitters) == (12, 8, 3, True)
+        assert (scene.width, scene.height) == (12, 8)
+        assert (scene.integrator.max_depth, scene.integrator.hide_emitters) == (3, True)
         assert scene.own.scale == 2
     # The same samples: what differs is that a built scene has its rotation in single precision.
     assert np.allclose(built.to_world, parsed.to_world, atol=1e-7)
@@ -146,7 +147,7 @@ def test_a_built_scene_s_integrator_asks_for_the_same_as_a_dict_s(integrator):
     made = ball(np.ones((4, 8, 3), np.float32)) | {"integrator": integrator}
     built, parsed = (envedit.load_scene(scene) for scene in (mi.load_dict(made), made))
     for name in ("max_depth", "rr_depth", "hide_emitters"):
-        assert getattr(built, name) == getattr(parsed, name)
+        assert getattr(built.integrator, name) == getattr(parsed.integrator, name)
     assert len(built.notes) == len(parsed.notes)
 
 
@@ -171,6 +172,8 @@ def test_a_built_scene_that_cannot_be_used_is_refused():
     [
         (lambda: {"settings": 3}, ConfigError, ["settings: got 3, expected a Config, a dict of tables"]),
         (lambda: {"settings": {"scene": {"fil": "a"}}}, ConfigError, ["no key fil", "did you mean file?"]),
+        (lambda: {"watch": 3}, ConfigError, ["watch: got 3, expected a Watch"]),
+        (lambda: {"base": 3}, ConfigError, ["base: got 3, expected a path"]),
         (lambda: {"mask": np.ones((4, 4))}, ConfigError, ["mask: got one without a target"]),
         (lambda: {"target": np.ones(3), "target_map": np.ones(3)}, ConfigError, ["got both, expected one"]),
         (lambda: {"envmap": "sky.exr"}, InputError, ["envmap: got 'sky.exr', expected an array"]),
@@ -223,6 +226,12 @@ def test_codes_of_a_picture_as_radiance_are_warned_of():
         (lambda: envedit.load_map("none.exr", width=64.0), "must be even, from 6 to 32768, got 64.0"),
         (lambda: envedit.load_map("none.exr", width="64"), "must be even, from 6 to 32768, got '64'"),
         (lambda: envedit.fit(np.ones((8, 16, 3)), seed=-1), "seed: got -1, expected an integer"),
+        (lambda: envedit.fit(np.ones((8, 16, 3)), 3), "network: got 3, expected a Representation or a dict"),
+        (lambda: envedit.fit(np.ones((8, 16, 3)), folder=3), "folder: got 3, expected a path"),
+        (lambda: envedit.load_scene("sphere", base=3), "base: got 3, expected a path"),
+        (lambda: envedit.Result.save(object(), None), "folder: got None, expected a path"),
+        (lambda: envedit.Result.samples(object(), 1.5), "count: got 1.5, expected an integer"),
+        (lambda: envedit.Result.samples(object(), 1, seed=-1), "seed: got -1, expected an integer"),
         (lambda: envedit.sunsky(63), "input.width: got 63, expected an even integer"),
         (lambda: envedit.LightTransport.build("sphere", spp="many"), "renderer.spp: got 'many', expected"),
         (lambda: envedit.LightTransport.build(3), "scene: got int, expected a file, a dict"),
@@ -271,6 +280,12 @@ def test_importing_envedit_limits_the_threads_of_numpy_but_not_against_the_user(
     code = f"import os, envedit; assert os.environ['OPENBLAS_NUM_THREADS'] == '{threads}'"
     rest = {name: value for name, value in os.environ.items() if name != "OPENBLAS_NUM_THREADS"}
     subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT, env=rest | given)
+
+
+@pytest.mark.parametrize("first", ["dir(envedit)", "import envedit.cli.fit"])
+def test_mitsuba_is_not_imported_before_it_is_used_where_ctrl_c_may_come(first):
+    code = f"import sys, envedit; {first}; assert 'mitsuba' not in sys.modules; envedit.Config()"
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)
 
 
 @pytest.mark.slow

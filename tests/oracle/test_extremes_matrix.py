@@ -7,6 +7,7 @@ from envedit import pipeline
 from envedit.core import latlong
 from envedit.core.errors import InputError
 from envedit.images import images
+from envedit.inputs import Replacements
 from envedit.representations import LogPixels, Pixels
 from envedit.representations.layers.layers import Layers
 from envedit.scene import scene
@@ -81,11 +82,11 @@ def test_a_picture_beyond_all_light_counts_as_bright_as_can_be(tmp_path):
     lit = scene.load(settings.scene.file, settings.scene.width)
     picture = initial_rendering.initial(lit, m, settings)
     picture[3, 4] = 3e38
-    made = target.make(settings, lit, m, picture)
+    made = target.make(settings, lit, m, Replacements(target=picture))
     assert any("target: 1 pixel is brighter than 1.27e+30" in line for line in made.warnings)
     assert (made.picture[3, 4] == np.float32(2.0**100)).all()
     picture[3, 4] = 1e30
-    made = target.make(settings, lit, m, picture)
+    made = target.make(settings, lit, m, Replacements(target=picture))
     np.testing.assert_array_equal(made.picture, picture)
     assert not made.warnings
 

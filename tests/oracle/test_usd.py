@@ -527,6 +527,20 @@ def test_references_that_multiply(tmp_path):
 # ---- Files -------------------------------------------------------------------------------------------------
 
 
+def test_a_load_looks_for_the_converted_scene_once(tmp_path, monkeypatch):
+    stage = new_stage(tmp_path)
+    add_camera(stage)
+    add_square(stage)
+    asked = []
+    kept = conversion.kept
+    monkeypatch.setattr(conversion, "kept", lambda file: asked.append(file) or kept(file))
+    notes = scene.load(saved(stage), 8).notes
+    assert len(asked) == 1 and "shot.usda: no light in the stage: give a map (/)" in notes
+    (tmp_path / "file").touch()  # where no cache can be kept, the scene is made for this process
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    assert scene.load(saved(stage), 8).notes == notes
+
+
 @pytest.mark.slow
 def test_a_scene_is_made_anew_when_a_layer_changes(tmp_path):
     below = new_stage(tmp_path, name="below.usda")
@@ -623,4 +637,4 @@ def test_what_a_run_leaves_changes_nothing_of_the_file_but_its_sky(tmp_path, rng
     envmap, _ = inputs.load_map(config.Input(envmap="scene", width=16), again)
     rendered = again.render(envmap, 256, 3)
     np.testing.assert_allclose(rendered.mean(), result.render.mean(), rtol=0.02)
-    np.testing.assert_allclose(envmap, 2 * result.given.radiance, rtol=1e-5)
+    np.testing.assert_allclose(envmap, 2 * result.input_map.radiance, rtol=1e-5)

@@ -407,16 +407,6 @@ def test_a_sun_that_is_gone_leaves_no_ghost():
     assert result[old].max() < 4 * np.median(result[old]) and source[old].max() > 1e4 * np.median(source[old])
 
 
-@pytest.mark.parametrize("shape", [(64, 128), (48, 96)])
-def test_a_source_that_is_not_larger_takes_the_edited_map(shape, rng):
-    source = sky(*shape)
-    working = source if shape == WORKING else latlong.resize(source, *WORKING)
-    edited = working * noise(rng)
-    result = ratio(working, edited, source)
-    inside = active(source, (0, 31))
-    np.testing.assert_array_equal(result[inside], latlong.resize(edited, *shape)[inside])
-
-
 # ---- rows below the horizon that follow --------------------------------------------------------------------
 @pytest.mark.slow
 @pytest.mark.parametrize("finer", [2, 4])

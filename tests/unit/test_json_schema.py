@@ -11,8 +11,7 @@ import pytest
 
 from envedit import config
 from envedit.cli import schema as command
-from envedit.config.json_schema import json_schema
-from envedit.config.reference import markdown
+from envedit.config.reference import json_schema, markdown
 from envedit.config.schema import FIELDS, TOP
 from envedit.config.validators import Choice, Integer, Number, WantedError
 from envedit.core import shipped

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from envedit import config, inputs
-from envedit.config import light_schema
+from envedit.config.list_schema import LIGHT_SHAPES
 from envedit.core import latlong
 from envedit.core.color import LUMINANCE
 from envedit.core.errors import ConfigError, InputError
@@ -80,7 +80,7 @@ AREA = {
 """Of each shape in steradian, for a size of 6 degrees and an aspect of 1/2, as if the sphere were flat."""
 
 
-@pytest.mark.parametrize("shape", [one for one in light_schema.SHAPES if one != "image"])
+@pytest.mark.parametrize("shape", [one for one in LIGHT_SHAPES if one != "image"])
 @pytest.mark.parametrize("softness", [0.0, 1.0])
 @pytest.mark.parametrize("elevation", [-90.0, 20.0, 89.9])
 def test_a_shape_has_its_flux_its_area_and_its_place(shape, softness, elevation):

@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from envedit import config as cfg
-from envedit.config import reading, schema
+from envedit.config import schema, toml
 from envedit.core.errors import ConfigError
 from tests.oracles.builders import refused
 
@@ -53,13 +53,13 @@ def test_gauss_newton_without_layers_or_a_transport_is_refused(tables):
     ("seed=0x", ("seed",), "0x"),
 ])  # fmt: skip
 def test_overrides_are_toml_or_bare_words(text, keys, value):
-    assert reading.parse_override(text) == (keys, value)
+    assert toml.parse_override(text) == (keys, value)
 
 
 @pytest.mark.parametrize("text", ["", "fit.epochs", "=3", "fit.=3", ".epochs=3", 3])
 def test_an_override_without_key_or_value_is_refused(text):
     with pytest.raises(ConfigError, match="expected table.key=value"):
-        reading.parse_override(text)
+        toml.parse_override(text)
 
 
 # ---- refusals ----------------------------------------------------------------------------------------------

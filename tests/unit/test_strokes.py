@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from envedit import config as cfg
-from envedit.config.stroke_schema import STROKES, StrokeList
+from envedit.config.list_schema import STROKES, StrokeList
 from envedit.core.color import TONEMAPS, inverse_tonemap, luminance, tonemap
 from envedit.targets import stroke_shapes, strokes
 from tests.oracles import ROOT
@@ -311,7 +311,7 @@ DOT = "points = [[0.5, 0.5]], width = 0.1"
     (f"type = 'shadow', {DOT}, widht = 1", "target.strokes[1]: has no key 'widht'; did you mean width?"),
     ("type = 'shadow'", "target.strokes[1]: got no shape, expected one of points, polygon"),
     ("type = 'blur', radius = 1, width = 1", "strokes[1].width: got 1.0, expected none but with points"),
-    ("type = 'light', width = 1, points = [[0, 0], [1]]", "expected a list of 2 numbers at point 1"),
+    ("type = 'light', width = 1, points = [[0, 0], [1]]", "expected a list of 2 numbers at entry 1"),
     ("type = 'light', polygon = [[0, 0], [1, 1]]", "at least 3"),
     ("type = 'light', ellipse = [0, 0, 1]", "ellipse: got [0, 0, 1], expected [cx, cy, rx, ry] or"),
     (
@@ -338,6 +338,13 @@ def test_strokes_and_the_kind_of_target_go_together():
         assert "target.strokes: got 1, expected none" in message and 'target.kind = "strokes"' in message
     assert "target.file" in refused(f"[target]\nkind = 'strokes'\nfile = 'a.exr'\n{contrast}")
     assert "--set" in refused("", "target.strokes=[{type = 'blur'}]")
+
+
+def test_an_override_replaces_strokes_of_the_file_that_are_refused():
+    text = "[target]\nkind = 'strokes'\nstrokes = [{type = 'blurr'}]"
+    found = cfg.loads(text, overrides=["target.strokes=[{type = 'contrast'}]"])
+    assert found.target.strokes[0]["type"] == "contrast"
+    assert "target.strokes[0].type" in refused(text, "target.kind=strokes")
 
 
 def test_strokes_come_back_from_toml_equal_and_paint_the_same(rng):

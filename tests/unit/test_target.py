@@ -11,6 +11,7 @@ from envedit.core.color import tonemap
 from envedit.core.errors import ConfigError, InputError
 from envedit.core.seeds import Seeds
 from envedit.images import images
+from envedit.inputs import Replacements
 from envedit.scene import scene
 from envedit.targets import initial_rendering, pixel_weights, target
 from tests.oracles.builders import BALL, LIGHT, SENSOR, floats, png, sky, write_scene
@@ -120,7 +121,7 @@ def test_an_array_asks_what_its_file_would(ball, seen, tmp_path):
     picture[2:5, 3:9] *= 2
     file = floats(tmp_path / "painted.exr", picture)
     from_file = target.make(asking(kind="image", file=str(file), rotate_degrees=0), ball, envmap)
-    from_array = target.make(asking(), ball, envmap, picture)
+    from_array = target.make(asking(), ball, envmap, Replacements(target=picture))
     np.testing.assert_array_equal(from_array.picture, from_file.picture)
     np.testing.assert_array_equal(from_array.weight, from_file.weight)
     assert from_array.coverage.sum() == 3 * 6
@@ -150,7 +151,7 @@ def test_mask_of_an_array_overrides_what_is_seen(ball, seen):
     envmap, initial = seen
     mask = np.zeros(SIZE)
     mask[:2] = 0.5
-    made = target.make(asking(), ball, envmap, 2 * initial, mask)
+    made = target.make(asking(), ball, envmap, Replacements(target=2 * initial, mask=mask))
     np.testing.assert_array_equal(made.coverage[..., 0], mask)
     np.testing.assert_array_equal(made.picture[2:], initial[2:])
     np.testing.assert_allclose(made.picture[:2], 2 * initial[:2], rtol=1e-6)
@@ -165,7 +166,7 @@ def test_mask_of_an_array_overrides_what_is_seen(ball, seen):
 ])  # fmt: skip
 def test_arrays_that_cannot_be_used(ball, seen, picture, mask, says):
     with pytest.raises(InputError, match=says):
-        target.make(asking(), ball, seen[0], picture, mask)
+        target.make(asking(), ball, seen[0], Replacements(target=picture, mask=mask))
 
 
 # ---- a picture of the scene under other light -----------------------------------------------------------
@@ -201,7 +202,9 @@ def test_a_picture_of_the_scene_is_read_as_linear_radiance(ball, pictured, tmp_p
     assert (np.abs(srgb.picture - picture) < 1.5 * step).all() and (srgb.weight == 1).all()
     named = of_a_picture(ball, pictured, file=str(tmp_path / "a.png"), tonemap="gamma")
     np.testing.assert_allclose(named.picture, (shown_as_srgb(picture) / 255) ** 2.2, rtol=1e-4)
-    array = target.make(asking(kind="rendering", file=images.ARRAY), ball, envmap, picture)
+    array = target.make(
+        asking(kind="rendering", file=images.ARRAY), ball, envmap, Replacements(target=picture)
+    )
     np.testing.assert_array_equal(array.picture, picture)
     assert "given as an array" in array.source and (array.weight == 1).all()
 
@@ -220,7 +223,7 @@ def test_pixels_of_a_picture_that_are_clipped_or_masked_do_not_count(ball, pictu
     assert both.known_weight.sum() == 6 * SIZE[1] - 2 and not both.known_weight[7:].any()
     assert both.weight[1:7].all() and not both.weight[7:].any()
     asked = asking(kind="rendering", file=images.ARRAY)
-    array = target.make(asked, ball, envmap, picture, mask[..., 0] / 255)
+    array = target.make(asked, ball, envmap, Replacements(target=picture, mask=mask[..., 0] / 255))
     assert array.weight.sum() == 6 * SIZE[1] and len(array.asked) == 2
     mask[1:7], mask[2, 3:5] = 0, 255
     png(tmp_path / "m.png", mask)
@@ -316,5 +319,5 @@ def test_a_picture_of_the_scene_needs_a_file_or_an_array(ball, seen):
     settings = asking(kind="rendering")
     with pytest.raises(ConfigError, match="expected the picture of the scene"):
         target.make(settings, ball, seen[0])
-    made = target.make(settings, ball, seen[0], picture=seen[1])
+    made = target.make(settings, ball, seen[0], Replacements(target=seen[1]))
     assert made.coverage is None and made.picture.tobytes() == np.float32(seen[1]).tobytes()

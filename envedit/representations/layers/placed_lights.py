@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from envedit.config import light_schema
+from envedit.config.list_schema import LIGHT_SHAPES
 from envedit.core import latlong
 from envedit.core.arrays import tensor
 from envedit.core.color import LUMINANCE
@@ -56,7 +56,7 @@ class PlacedLights:
         self.lights = self.layers.separation.lights
 
     def params(self, placed: Sequence[dict]) -> dict:
-        """Return the layers' parameters of entries of :func:`.light_schema.LightList`; others are left out.
+        """Return the layers' parameters of entries of :func:`.list_schema.LightList`; others are left out.
 
         An entry of a light that the map does not have does nothing.
         """
@@ -183,13 +183,13 @@ def profile(light: dict, toward: np.ndarray, texel: float) -> np.ndarray:
     the rectangle times a ramp along y, a "gaussian" exp(-(x/a)^2 / 2 - (y/b)^2 / 2), an "image" the rectangle
     of the image's sides times the image (:func:`.light_images.sampled`).
 
-    Returns (..., 3). ``light`` is without the key ``light``, as of :func:`.light_schema.LightList`;
+    Returns (..., 3). ``light`` is without the key ``light``, as of :func:`.list_schema.LightList`;
     ``toward`` are unit vectors in the frame of the map, and ``texel`` is the spacing of the texels in
     radians: the least width of a border, and about the least of a light.
     """
     shape = light.get("shape", "gaussian")
     wide, high = light_images.shares(light["image"]) if shape == "image" else (1.0, 1.0)
-    aspect = light.get("aspect", light_schema.SHAPES[shape] or min(wide, high))
+    aspect = light.get("aspect", LIGHT_SHAPES[shape] or min(wide, high))
 
     # ---- Coordinates in radians along the sides
     azimuth, rotation = np.radians([light["azimuth"], light.get("rotation", 0)])

@@ -104,7 +104,7 @@ def kept(file: FilePath) -> Converted:
     Errors are those of :func:`convert`, which is asked for all cameras.
     """
     file = Path(file).absolute()
-    root = cache_folder("usd") or Path(_scratch().name)
+    root = _folder()
     key = json.dumps([str(file), _digests([str(file)]), _VERSION])
     folder = root / hashlib.sha256(key.encode()).hexdigest()[:32]
     xml = folder / f"{file.stem}.xml"
@@ -116,11 +116,7 @@ def kept(file: FilePath) -> Converted:
             return Converted(xml, tuple(known["notes"]), tuple(known["sources"]), known["stage"])
 
     # ---- Made in a folder beside, which takes the place of the old one
-    try:
-        root.mkdir(parents=True, exist_ok=True, mode=0o700)
-        draft = Path(tempfile.mkdtemp(prefix=".", dir=root))
-    except OSError as error:
-        raise InputError(f"{root}: cannot be written ({error.strerror})") from None
+    draft = Path(tempfile.mkdtemp(prefix=".", dir=root))
     try:
         converted = convert(file, draft / xml.name, "all")
         known = {"notes": converted.notes, "sources": _digests(converted.sources), "stage": converted.stage}
@@ -136,9 +132,20 @@ def kept(file: FilePath) -> Converted:
     return converted._replace(xml=xml)
 
 
+def _folder():
+    """Return the folder of converted scenes: of caches; where none can be kept, one of this process."""
+    root = cache_folder("usd")
+    if root is not None:
+        with contextlib.suppress(OSError):
+            root.mkdir(parents=True, exist_ok=True, mode=0o700)
+            if os.access(root, os.W_OK):
+                return root
+    return Path(_scratch().name)
+
+
 @functools.cache
 def _scratch():
-    """Return the folder of scenes where no caches are kept; it is gone when the process ends."""
+    """Return a folder that is gone when the process ends."""
     return tempfile.TemporaryDirectory(prefix="envedit_usd_")
 
 

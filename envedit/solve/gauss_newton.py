@@ -198,9 +198,7 @@ def descended(
         run.scale = min(run.scale, max(noise, halved))
 
         # ---- F linearised
-        problem.derivatives.angle = WIDE_ANGLE if run.wide else NARROW_ANGLE
-        normal = problem.normal(point, run.start, run.scale)
-        problem.derivatives.angle = NARROW_ANGLE
+        normal = _linearised(problem, run, point)
 
         # ---- A step that lowers F, where one may by enough
         before, better, promised = problem.loss(point, run.start, run.scale), None, normal.decrement
@@ -240,6 +238,14 @@ def descended(
     return point
 
 
+def _linearised(problem, run, point, bounded=False):
+    """Return the normal equations of a run's next step; ``bounded`` as of :meth:`.Problem.normal`."""
+    problem.derivatives.angle = WIDE_ANGLE if run.wide else NARROW_ANGLE
+    normal = problem.normal(point, run.start, run.scale, bounded=bounded)
+    problem.derivatives.angle = NARROW_ANGLE
+    return normal
+
+
 @dataclass(frozen=True)
 class _Trial:
     """A point that a step leads to, and the two parts of F there."""
@@ -257,9 +263,11 @@ def _lower(problem, run, point, normal):
     """Try steps of more and more damping until one lowers F.
 
     Returns the point that the run is at, F there, and the trial that is lower, or None. The point may have
-    been rendered anew, with the columns of T that a trial has more.
+    been rendered anew, with the columns of T that a trial has more. F does not depend on how white the sky is
+    until more of it is white than was: from the first trial on where it is, the equations count that.
     """
     before = problem.loss(point, run.start, run.scale)
+    bounded = problem.whitens(point)
     for _ in range(DAMPINGS_TRIED):
         state = problem.step(run.state, normal, run.damping)
         there = None if state is None else problem.evaluate(state, point.transport)
@@ -272,5 +280,9 @@ def _lower(problem, run, point, normal):
                     point, before = again, problem.loss(again, run.start, run.scale)
             if trial.loss < before:
                 return point, before, trial
+            if not bounded and problem.whitens(there):
+                bounded = True
+                normal = _linearised(problem, run, point, bounded)
+                continue
         run.damping = max(DAMPING_FACTOR * run.damping, RAISED_DAMPING)
     return point, before, None

@@ -208,6 +208,10 @@ class Problem(Unknowns):
         whitened = 0.0 if self.white_sky is None else self.white_sky.loss(point.edited)
         return self.from_start(point.state, start) + whitened
 
+    def whitens(self, point: Point) -> bool:
+        """Whether more of the sky is white than was, where that counts."""
+        return self.white_sky is not None and self.white_sky.loss(point.edited) > 0
+
     def from_start(self, state: dict, start: dict) -> float:
         """Return x' K x."""
         total = sum(v @ k @ v for v, k in zip(AXES @ state["gain"].T, self._precisions, strict=True))
@@ -230,12 +234,15 @@ class Problem(Unknowns):
 
     # ---- normal equations ----------------------------------------------------------------------------------
 
-    def normal(self, point: Point, start: dict, sigma: float, descent: bool = True) -> Normal:
+    def normal(
+        self, point: Point, start: dict, sigma: float, descent: bool = True, bounded: bool = False
+    ) -> Normal:
         """Linearise F at a point: gradient / 2 and Gauss-Newton Hessian / 2.
 
         The gradient by gain and saturation is exact, through T; their part of the Hessian, and what it has in
         common with lights, is that of the block transport. Without ``descent`` only the Hessian is asked for,
-        and the gradient is 0.
+        and the gradient is 0. ``bounded``: no more of the sky should be white than was, also where a step
+        would lead there.
         """
         state, n = point.state, self.nodes
         blocks, linear = self.blocks, self.derivatives.at(point)
@@ -285,7 +292,7 @@ class Problem(Unknowns):
 
         # ---- The mean of what was not painted, white sky, and the prior
         hessian += mean_by_unknowns.T @ mean_by_unknowns
-        self._add_white(hessian, gradient, point, linear)
+        self._add_white(hessian, gradient, point, linear, bounded)
         precision = self._precision(linear.named)
         hessian += precision
         if descent:
@@ -311,12 +318,12 @@ class Problem(Unknowns):
         """Return the normal equations without descent, at the noise that the residual shows."""
         return self.normal(point, start, self.likelihood.noise(point.residual), descent=False)
 
-    def _add_white(self, hessian, gradient, point, linear):
+    def _add_white(self, hessian, gradient, point, linear, bounded):
         """Add what white sky is to the normal equations."""
         if self.white_sky is None:
             return
-        slope, white = self.white_sky.linear(point.edited)
-        if white > 0:
+        slope, white = self.white_sky.linear(point.edited, bounded)
+        if slope.any():
             slope = slope[self.rows]
             by_nodes, by_saturation = self._by_sky(point, slope)
             others = [0.0] * 3 * self.photographed + [by_saturation] * self.saturates

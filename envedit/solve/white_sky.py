@@ -52,14 +52,20 @@ class WhiteSky:
 
     def loss(self, edited: np.ndarray) -> float:
         """Return the formula above for an edited map (H, W, 3)."""
-        return 3 * STATEMENTS * float(huber(self._size(edited), 1.0))
+        return 3 * STATEMENTS * float(huber(max(0.0, self._size(edited)), 1.0))
 
-    def linear(self, edited: np.ndarray) -> tuple[np.ndarray, float]:
-        """Return a slope by texels (H, W, 3), and a value whose square has the gradient of :meth:`loss`."""
+    def linear(self, edited: np.ndarray, bounded: bool = False) -> tuple[np.ndarray, float]:
+        """Return a slope by texels (H, W, 3), and a value whose square has the gradient of :meth:`loss`.
+
+        Both are 0 where no more is white, but if ``bounded``: then q counts below 0 as well, for steps that
+        would lead beyond.
+        """
         size = self._size(edited)
         scale = np.sqrt(3 * STATEMENTS / max(1.0, size))
         slope = np.zeros(edited.shape, np.float32)
-        if size > 0:
+        if not bounded:
+            size = max(0.0, size)
+        if size > 0 or bounded:
             sky = edited[: len(self.solid_angle)]
             darkest = sky.argmin(axis=2)[..., None]
             radiance = np.clip(np.take_along_axis(sky, darkest, axis=2).astype(np.float64), 1 / LIMIT, LIMIT)
@@ -70,8 +76,8 @@ class WhiteSky:
         return slope, scale * size
 
     def _size(self, edited):
-        """Return q."""
-        return self.per_share * max(0.0, _share(edited, self.solid_angle) - self.share)
+        """Return q, negative where less is white."""
+        return self.per_share * (_share(edited, self.solid_angle) - self.share)
 
 
 def _share(envmap, solid_angle):

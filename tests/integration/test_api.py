@@ -282,12 +282,6 @@ def test_importing_envedit_limits_the_threads_of_numpy_but_not_against_the_user(
     subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT, env=rest | given)
 
 
-@pytest.mark.parametrize("first", ["dir(envedit)", "import envedit.cli.fit"])
-def test_mitsuba_is_not_imported_before_it_is_used_where_ctrl_c_may_come(first):
-    code = f"import sys, envedit; {first}; assert 'mitsuba' not in sys.modules; envedit.Config()"
-    subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)
-
-
 @pytest.mark.slow
 def test_an_object_is_put_into_a_photograph_under_its_light(tmp_path, monkeypatch, here):
     """The example: the sun of the photograph is found, its curve too, and the box casts a shadow."""

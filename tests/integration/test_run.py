@@ -457,6 +457,8 @@ def test_help_needs_no_renderer(tmp_path):
         "except SystemExit as stop: assert stop.code == 0\n"
         "loaded = {'mitsuba', 'drjit', 'numpy', 'OpenEXR'} & set(sys.modules)\n"
         "assert not loaded, loaded\n"
+        "import envedit.cli.fit\n"
+        "assert 'mitsuba' not in sys.modules, 'imported where Ctrl-C does not wait'\n"
         "envedit.Config()"
     )
     found = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True)

@@ -268,7 +268,8 @@ def _lower(problem, run, point, normal):
     """
     before = problem.loss(point, run.start, run.scale)
     bounded = problem.whitens(point)
-    for _ in range(DAMPINGS_TRIED):
+    tried = 0
+    while tried < DAMPINGS_TRIED:
         state = problem.step(run.state, normal, run.damping)
         there = None if state is None else problem.evaluate(state, point.transport)
         if there is not None and there.residual is not None:
@@ -285,4 +286,5 @@ def _lower(problem, run, point, normal):
                 normal = _linearised(problem, run, point, bounded)
                 continue
         run.damping = max(DAMPING_FACTOR * run.damping, RAISED_DAMPING)
+        tried += 1
     return point, before, None

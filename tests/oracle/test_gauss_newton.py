@@ -394,6 +394,15 @@ def test_white_sky_counts_where_more_is_white(case):
     )
     np.testing.assert_allclose(gradient[some], found, rtol=0, atol=1e-2 * np.abs(found).max())
     assert white_sky.loss(edited(problem, start)) == 0
+    # Where a step would lead beyond, it counts before: the square of a linear function, which is 0 there.
+    problem.white_sky = white_sky
+    unedited = problem.evaluate(start)
+    free, bounded = (problem.normal(unedited, start, 1.0, bounded=one) for one in (False, True))
+    np.testing.assert_allclose(bounded.gradient, free.gradient, atol=1e-6 * np.abs(free.gradient).max())
+    rank_one = bounded.hessian - free.hessian
+    slope = rank_one[0] / np.sqrt(rank_one[0, 0])
+    np.testing.assert_allclose(rank_one, np.outer(slope, slope), atol=1e-6 * np.abs(rank_one).max())
+    assert slope[0] > 0
     assert WhiteSky.of(problem.envmap, 0.0).loss(point.edited) == 0
     assert white_sky.loss(edited(problem, start | {"gain": start["gain"] - 1})) == 0
 

@@ -139,8 +139,6 @@ class Stub:
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
-            # Trained weights of this machine would be part of the jobs' keys.
-            env=os.environ | {"XDG_CACHE_HOME": str(self.folder / "cache")},
         )
         self.drivers.append(started)
         return started

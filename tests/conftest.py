@@ -69,16 +69,14 @@ def threads_stay():
         assert dr.thread_count() == before
 
 
-@pytest.fixture(autouse=True)
-def no_weights():
-    """Keep trained weights that this machine may have out of every run.
-
-    By a patch of its own: ``monkeypatch`` would begin before the fixtures of modules, and end after them.
-    """
-    from envedit.losses.perceptual import installed
-
+@pytest.fixture(scope="session", autouse=True)
+def shared_cache(tmp_path_factory):
+    """Keep the user's caches, recent paintings and trained weights out of all tests, which share a cache."""
+    folder = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        folder = folder.parent
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(installed, "cache_folder", lambda kind: None)
+        patch.setenv("XDG_CACHE_HOME", str(folder / "cache"))
         yield
 
 

@@ -52,7 +52,7 @@ class WhiteSky:
 
     def loss(self, edited: np.ndarray) -> float:
         """Return the formula above for an edited map (H, W, 3)."""
-        return 3 * STATEMENTS * float(huber(max(0.0, self._size(edited)), 1.0))
+        return 3 * STATEMENTS * float(huber(np.maximum(self._size(edited), 0), 1.0))
 
     def linear(self, edited: np.ndarray, bounded: bool = False) -> tuple[np.ndarray, float]:
         """Return a slope by texels (H, W, 3), and a value whose square has the gradient of :meth:`loss`.
@@ -60,11 +60,9 @@ class WhiteSky:
         Both are 0 where no more is white, but if ``bounded``: then q counts below 0 as well, for steps that
         would lead beyond.
         """
-        size = self._size(edited)
-        scale = np.sqrt(3 * STATEMENTS / max(1.0, size))
+        size = self._size(edited) if bounded else max(0.0, self._size(edited))
+        scale = float(np.sqrt(3 * STATEMENTS / max(1.0, size)))
         slope = np.zeros(edited.shape, np.float32)
-        if not bounded:
-            size = max(0.0, size)
         if size > 0 or bounded:
             sky = edited[: len(self.solid_angle)]
             darkest = sky.argmin(axis=2)[..., None]
@@ -77,7 +75,7 @@ class WhiteSky:
 
     def _size(self, edited):
         """Return q, negative where less is white."""
-        return self.per_share * (_share(edited, self.solid_angle) - self.share)
+        return float(self.per_share * (_share(edited, self.solid_angle) - self.share))
 
 
 def _share(envmap, solid_angle):

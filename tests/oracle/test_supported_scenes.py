@@ -106,7 +106,7 @@ def test_plugins_that_are_replaced_or_refused(tmp_path):
         inside = "" if name in ("direct", "depth") else inside
         parts = f'<integrator type="{name}">{inside}</integrator>', SENSOR, BALL, light()
         lit, _, notes = users_scenes.loaded(users_scenes.write(tmp_path, parts))
-        assert lit.max_depth == expected.get(name, 4)
+        assert lit.integrator.max_depth == expected.get(name, 4)
         assert any("depth is not used" in note for note in notes) == (name == "depth")
     for key, expected in (("max_depth", "-1 or a whole"), ("rr_depth", "a whole")):
         zero = f'<integrator type="path"><integer name="{key}" value="0"/></integrator>'

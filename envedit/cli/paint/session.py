@@ -565,9 +565,6 @@ class Session:
             added = {k: None for k in problem.added(solved)}
             self.tell.say(answer | self._shares(asked, own | added))
             return
-        if asked.of == "highlight" and asked.light < 0 and not self._dragged:
-            self.tell.say(answer | self._shares(asked, own))
-            return
         for k, i in {} if self._dragged else own.items():
             if i is not None:  # where paint has put it
                 shown[i] = replace(shown[i], direction=problem.direction(solved, k))
@@ -587,8 +584,7 @@ class Session:
             lost = (solution.point.edited[rows] - solution.problem.layers.decode(dark).numpy()).mean(axis=2)
             i = -1 if i is None else i
             shares[i] = shares.get(i, 0.0) + float((seen[rows] * lost).sum()) / whole
-        most = max(shares, key=lambda i: shares[i], default=-1)
-        return {"light": most if shares.get(most, 0) > 0 else -1, "shares": list(shares.items())}
+        return {"light": max(shares, key=lambda i: shares[i], default=-1), "shares": list(shares.items())}
 
     # ---- results -------------------------------------------------------------------------------------------
 

@@ -112,7 +112,13 @@ def edit(
                 stack.enter_context(built_scene.kept(scene))
             loaded = built_scene.load(scene, chosen.scene, base)
             chosen = _of_scene(chosen, loaded)
-        given = inputs.Replacements(loaded, **arrays)
+        given = inputs.Replacements(
+            scene=loaded,
+            envmap=arrays.get("envmap"),
+            target_map=arrays.get("target_map"),
+            target=arrays.get("target"),
+            mask=arrays.get("mask"),
+        )
         result = run(_of_arrays(chosen, arrays), base=base, watch=watch, replacements=given)
     of_codes = [_warning_of_codes(name, named[name]) for name in arrays if name != "mask"]
     if any(of_codes):

@@ -267,7 +267,7 @@ def _lower(problem, run, point, normal):
     until more of it is white than was: from the first trial on where it is, the equations count that.
     """
     before = problem.loss(point, run.start, run.scale)
-    bounded = problem.whitens(point)
+    bounded = False
     tried = 0
     while tried < DAMPINGS_TRIED:
         state = problem.step(run.state, normal, run.damping)
@@ -281,7 +281,7 @@ def _lower(problem, run, point, normal):
                     point, before = again, problem.loss(again, run.start, run.scale)
             if trial.loss < before:
                 return point, before, trial
-            if not bounded and problem.whitens(there):
+            if not bounded and not problem.whitens(point) and problem.whitens(there):
                 bounded = True
                 normal = _linearised(problem, run, point, bounded)
                 continue

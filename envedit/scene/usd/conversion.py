@@ -116,7 +116,10 @@ def kept(file: FilePath) -> Converted:
             return Converted(xml, tuple(known["notes"]), tuple(known["sources"]), known["stage"])
 
     # ---- Made in a folder beside, which takes the place of the old one
-    draft = Path(tempfile.mkdtemp(prefix=".", dir=root))
+    try:
+        draft = Path(tempfile.mkdtemp(prefix=".", dir=root))
+    except OSError as error:
+        raise InputError(f"{root}: cannot be written ({error.strerror})") from None
     try:
         converted = convert(file, draft / xml.name, "all")
         known = {"notes": converted.notes, "sources": _digests(converted.sources), "stage": converted.stage}

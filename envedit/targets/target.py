@@ -79,11 +79,15 @@ class Target:
         return replace(self, picture=picture) if self.compared is None else replace(self, compared=picture)
 
     def seen_as(self, seen: np.ndarray, rendering: np.ndarray) -> Target:
-        """Return the target as T sees it: with what T misses of a map's rendering, (h, w, 3), taken off.
+        """Return the target as T sees it: without what T, ``seen``, misses of a map's rendering, (h, w, 3).
 
-        T of this map matches its own rendering exactly then, and nothing is spent on the noise of both.
+        What is asked for beside the rendering is asked for beside T's: more light as a sum, less as a factor,
+        so that nothing falls below black. Nothing is spent on the noise of both.
         """
-        return replace(self, compared=np.maximum(self.picture + (seen - rendering), 0).astype(np.float32))
+        less = np.minimum(self.picture, rendering)
+        more = self.picture - less
+        factor = np.divide(less, rendering, out=np.ones_like(less), where=rendering > 0)
+        return replace(self, compared=(factor * seen + more).astype(np.float32))
 
     def developed(self, photograph: photographs.Photo) -> Target:
         """Return the target with its photograph, whose camera and place are known better."""

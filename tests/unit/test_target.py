@@ -321,3 +321,14 @@ def test_a_picture_of_the_scene_needs_a_file_or_an_array(ball, seen):
         target.make(settings, ball, seen[0])
     made = target.make(settings, ball, seen[0], Replacements(target=seen[1]))
     assert made.coverage is None and made.picture.tobytes() == np.float32(seen[1]).tobytes()
+
+
+def test_what_is_asked_for_beside_a_rendering_is_asked_for_beside_that_of_the_transport():
+    rendering = np.float32([[[0.5, 0.5, 0.5], [0.5, 0.0, 1e-30], [0.2, 0.2, 65504]]])
+    picture = np.float32([[[0.1, 0.5, 0.75], [0.0, 0.3, 1e6], [0.2, 0.1, 65504]]])
+    seen = np.float32([[[0.3, 0.4, 0.4], [0.2, 0.1, 0.0], [0.1, 0.4, 60000]]])
+    asked = target.Target(picture, np.ones((1, 3, 1), np.float32), None, "")
+    aim = asked.seen_as(seen, rendering).aim
+    expected = [[[0.06, 0.4, 0.65], [0.0, 0.4, 1e6], [0.1, 0.2, 60000]]]
+    assert np.allclose(aim, expected, rtol=1e-6), "less as a factor, more as a sum"
+    assert np.array_equal(asked.seen_as(seen, picture).aim, seen), "nothing is asked for"

@@ -45,7 +45,7 @@ class Project:
         return replace(settings, output=_without(settings.output, dir=str(self.folder)))
 
     def text(self, document: Document, start: str = "") -> str:
-        """Return ``painted.toml``: what was given, what was painted, and the solution that goes on from."""
+        """Return ``painted.toml``: what was given, what was painted, and the solution where there is one."""
         settings = self.settings
         target = {"kind": "strokes", "strokes": document.strokes} if document.strokes else {"kind": "none"}
         kept = ("tonemap", "paint", "hold", "spp") if document.strokes else ("spp",)
@@ -60,7 +60,7 @@ class Project:
             if name not in LISTS and value != getattr(Document, name):
                 given[TABLES[name]][name] = value
         if start:
-            given["optimizer"]["start"] = start
+            given["optimizer"] |= {"start": start, "iterations": 0}  # the map that was shown, and no other
         given["output"].pop("dir", None)
         lines = [
             f"# Painted with `envedit paint`; `envedit run {NAME}` makes the same map.",
@@ -167,13 +167,14 @@ def _path(envmap):
 
 def _plain(settings, folder):
     """Return settings without what the document has."""
+    solved = ("start", "iterations") if settings.optimizer.start else ()
     return replace(
         settings,
         input=_without(settings.input, "lights", "regions", *ORIENTATION),
         output=_without(settings.output, "exposure", "temperature", dir=str(folder)),
         target=_without(settings.target, "kind", "strokes", "file", "mask", "rotate_degrees", "rest"),
         solve=_without(settings.solve, "freedom"),
-        optimizer=_without(settings.optimizer, "start"),
+        optimizer=_without(settings.optimizer, *solved),
     )
 
 

@@ -5,8 +5,7 @@ Everything here runs on the thread that owns Dr.Jit. What an edit asks for at on
 new edit comes.
 
 The solution (``solution.py``) is towards paint on T E_0, of a large picture at the size at which edits are
-solved. The edit that is saved is the pipeline's, which paints on Mitsuba's rendering, goes on from the
-solution here, and judges its result.
+solved. The edit that is saved is the pipeline's, which takes the solution here, and judges its result.
 """
 
 from __future__ import annotations
@@ -591,7 +590,7 @@ class Session:
     def save(self) -> list[str]:
         """Write ``painted.toml`` and the folder of an ``envedit run`` of it; returns its warnings.
 
-        The run goes on from the solution that is shown, which is solved to its end first.
+        Its map is that of the solution that is shown, which is solved to its end first.
         """
         self._saving = True
         try:
@@ -616,7 +615,7 @@ class Session:
             solved = gauss_newton.Run(run.state, run.start, hold=self.solution.hold)
             checkpoint.save_solution(folder / SOLUTION, solved)
 
-        # ---- The run that goes on from it
+        # ---- The run that has its map
         settings = installed.settled(project.configured(self.document, start))
 
         def stage(text):

@@ -189,11 +189,15 @@ class _Edit:
             self.target = None
             if settings.target.kind == "none":
                 return
-            self.small = working_size.smaller(settings, self.scene)
+            expected = settings.target.kind in ("image", "strokes")
+            self.small = working_size.smaller(settings, self.scene, painted=expected)
             renderers.check(settings, self.small, self.original.shape[:2])
             self.watch.stage("rendering the target")
             self.target = make_target(settings, self.scene, self.original, self.replacements)
             self.warnings += self.target.warnings
+            painted = self.target.coverage is not None
+            if painted != expected:  # an image of another light, or paint as an array
+                self.small = working_size.smaller(settings, self.scene, painted)
 
     @property
     def to_solve(self):

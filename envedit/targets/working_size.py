@@ -20,28 +20,30 @@ from envedit.targets import initial_rendering, rendered_anew
 from envedit.targets.pixel_weights import first_hold, hidden_pixels, pixel_weight
 from envedit.targets.target import Target, with_noise
 
-PIXELS = 128 * 128
-"""Pixels that an edit is solved on with "auto" (``docs/decisions/defaults.md``)."""
+PIXELS, PAINTED_PIXELS = 128 * 128, 64 * 64
+"""Pixels that an edit is solved on with "auto", and one towards paint (``docs/decisions/defaults.md``)."""
 MUCH = 1.8
 """How many times as many pixels a picture must have to be worked on at a smaller size."""
 
 
-def most_pixels(settings: config.Config) -> int | None:
-    """Return the most pixels that an edit is solved on; None: as many as there are."""
+def most_pixels(settings: config.Config, painted: bool = False) -> int | None:
+    """Return the most pixels that an edit is solved on, towards paint or not; None: as many as there are."""
     pixels = settings.renderer.pixels
     if isinstance(pixels, int):
         return pixels
     chosen = settings.representation
     smooth = isinstance(chosen.cycles, str) or chosen.cycles <= CYCLES
-    return PIXELS if smooth and settings.newton else None
+    if not smooth or not settings.newton:
+        return None
+    return PAINTED_PIXELS if painted else PIXELS
 
 
-def smaller(settings: config.Config, scene: Scene) -> Scene:
-    """Return the scene on a film of at most so many pixels as are asked for, all views together.
+def smaller(settings: config.Config, scene: Scene, painted: bool = False) -> Scene:
+    """Return the scene on a film of at most so many pixels as :func:`most_pixels`, all views together.
 
     It is the scene itself where its film is hardly larger, or somebody has built it.
     """
-    most, pixels = most_pixels(settings), scene.width * scene.height
+    most, pixels = most_pixels(settings, painted), scene.width * scene.height
     if most is None or pixels <= MUCH * most:
         return scene
     small = scaled(scene, (most / pixels) ** 0.5)

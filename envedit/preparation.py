@@ -376,9 +376,7 @@ def _misfits(rendering, picture, weight):
 
     Of areas, as many as residuals are independent, noise is smaller, and a small change of the light is not.
     """
-    off = turning.residuals(rendering, picture)
-    if weight is not None:
-        off = off * weight / weight.mean(dtype=np.float64)
+    off = turning.residuals(rendering, picture) * weight / weight.mean(dtype=np.float64)
     height, width, _ = off.shape
     across = math.isqrt(INDEPENDENT)
     parts = off, resampling.fit(off, min(across, height), min(across, width))

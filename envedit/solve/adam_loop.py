@@ -42,7 +42,7 @@ class Objective:
         A number or a (start, end) ramp for every term; terms of weight 0 are not computed.
     picture : ndarray (h, w, 3)
         Target, linear radiance.
-    pixel_weight : ndarray (h, w, 1) or None
+    pixel_weight : ndarray (h, w, 1)
         How much each pixel counts.
     original : ndarray (rows, W, 3)
         The active rows of the original map.
@@ -61,7 +61,7 @@ class Objective:
         self,
         weights: config.Loss,
         picture: np.ndarray,
-        pixel_weight: np.ndarray | None,
+        pixel_weight: np.ndarray,
         original: np.ndarray,
         iterations: int,
         dists: distances.Dists = None,
@@ -75,7 +75,7 @@ class Objective:
             if value and (name != "dists" or dists)
         }
         self._target = dr.opaque(to_display(tensor(picture)))
-        self._weight = None if pixel_weight is None else tensor(pixel_weight)
+        self._weight = tensor(pixel_weight)
         self._original = tensor(original)
         self._ssim: Ssim | StackedSsim
         if len(views) > 1:

@@ -33,7 +33,7 @@ from envedit.core.rows import Rows
 from envedit.core.seeds import SIGNS
 from envedit.images import map_regions
 from envedit.solve.gain_bandwidth import PROBES
-from envedit.solve.likelihood import STATEMENTS, Likelihood, on_average_one
+from envedit.solve.likelihood import STATEMENTS, Likelihood
 from envedit.transport.block_transport import sky_cells
 from envedit.transport.light_transport import LightTransport
 
@@ -137,7 +137,7 @@ def reachable(
     active[slice(None) if rows is None else rows.slice] = True
     if kept is not None:
         active &= kept < map_regions.KEPT_SHARE
-    likelihood = likelihood or Likelihood(on_average_one(None, transport.shape))
+    likelihood = likelihood or Likelihood(np.ones((*transport.shape, 1), np.float32))
     painted = likelihood.weight[..., 0] > 0 if painted is None else painted
     transport = transport.resolved(original)
     initial = _rendering(transport, original)

@@ -35,7 +35,7 @@ from envedit.losses import display_curve
 from envedit.representations.layers.layers import Layers
 from envedit.solve.block_jacobian import BlockJacobian
 from envedit.solve.derivatives import Derivatives
-from envedit.solve.likelihood import Likelihood, on_average_one
+from envedit.solve.likelihood import Likelihood
 from envedit.solve.normal_equations import Normal, solved
 from envedit.solve.prior import AXES, Prior
 from envedit.solve.unknowns import LOG_SATURATIONS, Point, Unknowns, in_numpy
@@ -142,7 +142,7 @@ class Problem(Unknowns):
 
     def _aim(self, picture, likelihood):
         self.picture = picture
-        self.likelihood = likelihood or Likelihood(on_average_one(None, picture.shape[:2]))
+        self.likelihood = likelihood or Likelihood(np.ones((*picture.shape[:2], 1), np.float32))
         self.target = display_curve.values(picture, self.likelihood.white)
         unpainted = self.likelihood.unpainted
         self.white_sky = WhiteSky.of(self.envmap, unpainted) if unpainted > 0 else None

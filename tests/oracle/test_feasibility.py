@@ -57,7 +57,7 @@ def render(transport, image):
 
 
 def weighed(weight):
-    return Likelihood(on_average_one(weight, PIXELS))
+    return Likelihood(on_average_one(weight))
 
 
 def descend(a, b, sweeps=500):

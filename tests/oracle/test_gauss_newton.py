@@ -87,7 +87,7 @@ def moved(problem, state, unknowns, k, h):
 @pytest.fixture(scope="module")
 def case():
     """A sky with a lamp, and a state where every unknown has moved."""
-    return moved_case(lambda weight: Likelihood(on_average_one(weight, FILM)))
+    return moved_case(lambda weight: Likelihood(on_average_one(weight)))
 
 
 @pytest.fixture(scope="module")
@@ -110,7 +110,7 @@ def photographed():
     clipped[::2, ::2] = True
     photo = map_problem.Photographed(factor, np.diag([3.0, 4.0, 5.0]))
     problem, params, start, state = moved_case(
-        lambda weight: Likelihood(on_average_one(weight, FILM)), photo=photo, clipped=clipped
+        lambda weight: Likelihood(on_average_one(weight)), photo=photo, clipped=clipped
     )
     return problem, params, start, state | {"camera": np.array([[0.3, -0.2, 0.1]])}
 

@@ -201,15 +201,15 @@ def descended(
         normal = _linearised(problem, run, point)
 
         # ---- A step that lowers F, where one may by enough
-        before, better, promised = problem.loss(point, run.start, run.scale), None, normal.decrement
+        better, promised = None, normal.decrement
         if hopeless and hopeless(point, (most - len(run.history)) * promised):
             break
-        if promised >= LEAST_DECREASE * before:
-            point, before, better = _lower(problem, run, point, normal)
-        loss = before if better is None else better.loss
+        if promised >= LEAST_DECREASE * problem.loss(point, run.start, run.scale):
+            point, better = _lower(problem, run, point, normal)
 
         # ---- Whether it is the last one
-        little = better is None or before - loss < LEAST_DECREASE * before
+        before, after = (problem.loss(one, run.start, run.scale) for one in (point, better or point))
+        little = better is None or before - after < LEAST_DECREASE * before
         ended = little and run.scale <= 1.01 * problem.likelihood.noise(point.residual, largest_noise)
         run.finished = ended and (run.wide or not problem.shining(run.state))
         if ended and not run.wide:  # other derivatives: what damping those needed says nothing of them
@@ -217,15 +217,15 @@ def descended(
 
         # ---- Taken, and noted
         if better is not None:
-            point = better.point
+            point = better
             run.state = point.state
             run.damping = max(run.damping / DAMPING_FACTOR, LEAST_DAMPING)
             run.history.append(
                 {
                     "iteration": len(run.history),
-                    "loss": better.loss,
-                    "data": better.misfit,
-                    "prior": better.penalty,
+                    "loss": after,
+                    "data": problem.likelihood.misfit(point.residual, run.scale),
+                    "prior": problem.penalty(point, run.start),
                     "sigma": run.scale,
                     "residual": float(np.sqrt(np.square(point.residual).mean())),
                     "damping": run.damping,
@@ -246,45 +246,37 @@ def _linearised(problem, run, point, bounded=False):
     return normal
 
 
-@dataclass(frozen=True)
-class _Trial:
-    """A point that a step leads to, and the two parts of F there."""
-
-    point: Point
-    misfit: float
-    penalty: float
-
-    @property
-    def loss(self):
-        return self.misfit + self.penalty
-
-
 def _lower(problem, run, point, normal):
     """Try steps of more and more damping until one lowers F.
 
-    Returns the point that the run is at, F there, and the trial that is lower, or None. The point may have
-    been rendered anew, with the columns of T that a trial has more. F does not depend on how white the sky is
-    until more of it is white than was: from the first trial on where it is, the equations count that.
+    Returns the point that the run is at, as of :func:`_tried`, and the one that is lower, or None. F does not
+    depend on how white the sky is until more of it is white than was: from the first step on that leads
+    there, the equations count that.
     """
-    before = problem.loss(point, run.start, run.scale)
     bounded = False
-    tried = 0
-    while tried < DAMPINGS_TRIED:
-        state = problem.step(run.state, normal, run.damping)
-        there = None if state is None else problem.evaluate(state, point.transport)
-        if there is not None and there.residual is not None:
-            misfit = problem.likelihood.misfit(there.residual, run.scale)
-            trial = _Trial(there, misfit, problem.penalty(there, run.start))
-            if trial.loss >= before:
-                again = problem.evaluate(run.state, there.transport, resolve=False)
-                if again.residual is not None:
-                    point, before = again, problem.loss(again, run.start, run.scale)
-            if trial.loss < before:
-                return point, before, trial
-            if not bounded and not problem.whitens(point) and problem.whitens(there):
-                bounded = True
-                normal = _linearised(problem, run, point, bounded)
-                continue
+    for _ in range(DAMPINGS_TRIED):
+        point, there, lower = _tried(problem, run, point, normal)
+        if there and not (lower or bounded) and problem.whitens(there) and not problem.whitens(point):
+            bounded, normal = True, _linearised(problem, run, point, bounded=True)
+            point, there, lower = _tried(problem, run, point, normal)
+        if lower:
+            return point, there
         run.damping = max(DAMPING_FACTOR * run.damping, RAISED_DAMPING)
-        tried += 1
-    return point, before, None
+    return point, None
+
+
+def _tried(problem, run, point, normal):
+    """Make one step; returns where it is from, where it leads, or None, and whether F is lower there.
+
+    Where it is not, the former is rendered anew, with the columns of T that the latter has more.
+    """
+    state = problem.step(run.state, normal, run.damping)
+    there = None if state is None else problem.evaluate(state, point.transport)
+    if there is None or there.residual is None:
+        return point, None, False
+    before, after = (problem.loss(one, run.start, run.scale) for one in (point, there))
+    if after >= before:
+        again = problem.evaluate(run.state, there.transport, resolve=False)
+        if again.residual is not None:
+            point, before = again, problem.loss(again, run.start, run.scale)
+    return point, there, after < before

@@ -136,32 +136,14 @@ class State:
 
 
 def place_rows(original: mi.TensorXf, crop: mi.TensorXf, first: int) -> mi.TensorXf:
-    """Replace rows ``first`` ... of a map (H, W, 3) by ``crop``, differentiably in the crop."""
-    if crop.shape[0] == original.shape[0]:
-        return crop
-    return dr.custom(_PlaceRows, crop, dr.detach(original), first * original.shape[1] * 3)
+    """Replace rows ``first`` ... of a map (H, W, 3) by ``crop``, differentiably in the crop.
 
-
-class _PlaceRows(dr.CustomOp):
-    """The gradient of the crop is a slice.
-
-    Written out, because the adjoint of ``dr.gather`` adds with atomics, which drop NaN on LLVM: a bad step
-    would look good.
+    The gradient of the crop is a slice, in which NaN shows: a sum with atomics drops it on LLVM.
     """
-
-    def eval(self, crop, original, start):
-        self.start, self.shape = dr.opaque(mi.UInt32, start), crop.shape
-        i = dr.arange(mi.UInt32, len(original.array))
-        inside = (i >= self.start) & (i < self.start + len(crop.array))
-        edited = dr.gather(mi.Float, crop.array, i - self.start, inside)
-        return mi.TensorXf(dr.select(inside, edited, original.array), original.shape)
-
-    def backward(self):
-        index = dr.arange(mi.UInt32, self.shape[0] * self.shape[1] * 3) + self.start
-        self.set_grad_in("crop", mi.TensorXf(dr.gather(mi.Float, self.grad_out().array, index), self.shape))
-
-    def name(self):
-        return "place rows"
+    last = first + crop.shape[0]
+    above = [original[:first]] if first > 0 else []
+    below = [original[last:]] if last < original.shape[0] else []
+    return dr.concat([*above, crop, *below])
 
 
 class _Slopes:

@@ -55,20 +55,6 @@ LARGEST_STEP = {
 
 
 @dataclass(frozen=True)
-class Photographed:
-    """What a photograph adds to a problem."""
-
-    # (3,), exposure and white balance by which the target has been divided, less what they are drawn to
-    log_factor: np.ndarray
-    precision: np.ndarray  # (3, 3), inverse covariance of their sum, about 0
-
-    @classmethod
-    def of(cls, photo: Photo) -> Photographed:
-        """Return what a photograph adds."""
-        return cls(photo.camera.log_factor - photo.centre, photo.precision)
-
-
-@dataclass(frozen=True)
 class Posterior:
     """How well a picture determines the sky."""
 
@@ -108,8 +94,8 @@ class Problem(Unknowns):
         The saturation of its colours is an unknown.
     blocks : BlockJacobian, optional
         Of another problem of these layers and this transport; made where None.
-    photo : Photographed, optional
-        Of a photograph as the target.
+    photo : Photo, optional
+        The photograph that the target is.
     clipped : ndarray of bool (h, w, 3), optional
         Where the target is a lower bound.
     """
@@ -124,7 +110,7 @@ class Problem(Unknowns):
         prior: Prior | None = None,
         saturates: bool = False,
         blocks: BlockJacobian | None = None,
-        photo: Photographed | None = None,
+        photo: Photo | None = None,
         clipped: np.ndarray | None = None,
     ):
         super().__init__(layers, saturates, photo is not None)
@@ -217,7 +203,7 @@ class Problem(Unknowns):
         total = sum(v @ k @ v for v, k in zip(AXES @ state["gain"].T, self._precisions, strict=True))
         total += (state["saturation"][0, 0] / self.prior.saturation) ** 2
         if self.photo is not None:
-            factor = self.photo.log_factor + state["camera"][0]
+            factor = self.photo.off_centre + state["camera"][0]
             total += factor @ self.photo.precision @ factor
         for i in self.shining(state):
             change = self._flux_change(state, start, i)
@@ -382,7 +368,7 @@ class Problem(Unknowns):
             if name == "flux":
                 parts.append([self._flux_change(state, start, i)[axis]])
             elif name == "camera":
-                parts.append([self.photo.log_factor[axis] + state[name][i, axis]])
+                parts.append([self.photo.off_centre[axis] + state[name][i, axis]])
             elif name == "saturation":
                 parts.append(state[name][i])
             elif name == "turn":

@@ -23,6 +23,7 @@ from envedit.solve.likelihood import Likelihood, on_average_one
 from envedit.solve.map_problem import Problem
 from envedit.solve.prior import Prior, of_paint
 from envedit.solve.white_sky import WhiteSky
+from envedit.targets.photo import Camera, Photo
 from envedit.targets.pixel_weights import pixel_weight
 from tests.oracles.dense_transport import DenseTransport, node_shares
 from tests.oracles.maps import angle
@@ -108,7 +109,7 @@ def photographed():
     factor = np.array([0.4, 0.1, -0.3])
     clipped = np.zeros((*FILM, 3), bool)
     clipped[::2, ::2] = True
-    photo = map_problem.Photographed(factor, np.diag([3.0, 4.0, 5.0]))
+    photo = Photo(np.zeros((*FILM, 8)), Camera("linear", factor), ("linear",))
     problem, params, start, state = moved_case(
         lambda weight: Likelihood(on_average_one(weight)), photo=photo, clipped=clipped
     )

@@ -54,6 +54,11 @@ class Run:
     wide: bool = False
     corrected: bool = False  # the last steps, towards a target without T's error (:mod:`.layers_solver`)
 
+    @property
+    def angle(self) -> float:
+        """Rotation of the differences by a light's direction, radians."""
+        return WIDE_ANGLE if self.wide else NARROW_ANGLE
+
     def onward(self, **changes: Any) -> Run:
         """Return another run, with the defaults but for changes, that goes on from where this one is."""
         return Run(self.state, self.start, history=list(self.history), columns=self.columns, **changes)
@@ -198,7 +203,7 @@ def descended(
         run.scale = min(run.scale, max(noise, halved))
 
         # ---- F linearised
-        normal = _linearised(problem, run, point)
+        normal = problem.normal(point, run.start, run.scale, run.angle)
 
         # ---- A step that lowers F, where one may by enough
         better, promised = None, normal.decrement
@@ -238,14 +243,6 @@ def descended(
     return point
 
 
-def _linearised(problem, run, point, bounded=False):
-    """Return the normal equations of a run's next step; ``bounded`` as of :meth:`.Problem.normal`."""
-    problem.derivatives.angle = WIDE_ANGLE if run.wide else NARROW_ANGLE
-    normal = problem.normal(point, run.start, run.scale, bounded=bounded)
-    problem.derivatives.angle = NARROW_ANGLE
-    return normal
-
-
 def _lower(problem, run, point, normal):
     """Try steps of more and more damping until one lowers F.
 
@@ -257,7 +254,8 @@ def _lower(problem, run, point, normal):
     for _ in range(DAMPINGS_TRIED):
         point, there, lower = _tried(problem, run, point, normal)
         if there and not (lower or bounded) and problem.whitens(there) and not problem.whitens(point):
-            bounded, normal = True, _linearised(problem, run, point, bounded=True)
+            bounded = True
+            normal = problem.normal(point, run.start, run.scale, run.angle, bounded=True)
             point, there, lower = _tried(problem, run, point, normal)
         if lower:
             return point, there

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from envedit.core.array_cache import under
 from envedit.core.errors import NumericalError
 from envedit.solve.derivatives import NARROW_ANGLE, WIDE_ANGLE
 from envedit.solve.map_problem import Point, Posterior, Problem
@@ -75,15 +76,11 @@ class Run:
     @classmethod
     def of_arrays(cls, arrays: dict[str, np.ndarray], history: list[dict]) -> Run:
         """Make a run of what :meth:`arrays` returned."""
-        state, start = (
-            {k.removeprefix(f"{part}."): v for k, v in arrays.items() if k.startswith(f"{part}.")}
-            for part in ("state", "start")
-        )
         damping, scale, finished, most, hold, wide, corrected = arrays["numbers"].tolist()
         columns = arrays.get("columns")
         return cls(
-            state=state,
-            start=start,
+            state=under(arrays, "state."),
+            start=under(arrays, "start."),
             damping=damping,
             scale=scale or np.inf,
             finished=bool(finished),

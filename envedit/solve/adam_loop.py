@@ -17,7 +17,7 @@ import mitsuba as mi
 import numpy as np
 
 from envedit import config
-from envedit.core.arrays import tensor
+from envedit.core.arrays import flat, tensor
 from envedit.core.errors import NumericalError
 from envedit.core.types import Params, Views
 from envedit.losses import losses, optimizer
@@ -180,17 +180,6 @@ class _Slope(dr.CustomOp):
         return "finite gradient"
 
 
-class _Keep:
-    """Put a map's own texels, (rows, W, 3), where it may not change; differentiable in the crop."""
-
-    def __init__(self, original, free):
-        self._original = dr.opaque(mi.Float(np.ascontiguousarray(original, np.float32).ravel()))
-        self._free = dr.opaque(mi.Bool(np.repeat(free.ravel(), 3)))
-
-    def __call__(self, crop):
-        return mi.TensorXf(dr.select(self._free, crop.array, self._original), crop.shape)
-
-
 def adam_for(representation: Representation, params: Params, settings: config.Optimizer) -> optimizer.Adam:
     """Make the optimiser that a configuration asks for; a rate of "auto" is the representation's own."""
     rate = representation.lr if isinstance(settings.lr, str) else settings.lr
@@ -251,13 +240,17 @@ def optimise(
     """
     adam, state = adam or adam_for(representation, params, settings), state or State()
     fixed = tensor(envmap)
-    keep = _Keep(envmap[first_row : first_row + len(free)], free) if free is not None else None
+    if free is not None:
+        original = flat(mi.Float, np.float32(envmap[first_row : first_row + len(free)]))
+        changes = flat(mi.Bool, np.repeat(free, 3))
     while state.step < settings.iterations:
         start = time.perf_counter()
         leaves, slopes = adam.leaves(), _Slopes()
         with dr.isolate_grad():
             crop = representation.decode(leaves)
-            crop = slopes.pass_on(keep(crop) if keep else crop)
+            if free is not None:
+                crop = mi.TensorXf(dr.select(changes, crop.array, original), crop.shape)
+            crop = slopes.pass_on(crop)
             rendering = renderer.render(place_rows(fixed, crop, first_row), state.step)
             rendering = slopes.pass_on(rendering)
             total, terms = objective(rendering, crop, state.step)

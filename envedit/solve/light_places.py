@@ -216,7 +216,7 @@ class Places:
             mine = np.ascontiguousarray(pictures[..., c])
             slope, robust, residual, profile = (
                 np.broadcast_to(v, normal.slope.shape)[..., c].ravel()
-                for v in (normal.slope, normal.robust, normal.residual, linear.profile)
+                for v in (normal.slope, normal.robust, self.point.residual, linear.profile)
             )
             weighted = mine * np.float32(slope**2 * robust)
             mixed.append(j.T @ self.problem.blocks.sums(weighted * profile).T)

@@ -298,7 +298,6 @@ class Problem(Unknowns):
             linear=linear,
             robust=robust,
             slope=slope,
-            residual=point.residual,
             squared=squared,
             pulled=pulled,
             lights=lights_in_blocks,

@@ -15,7 +15,7 @@ import numpy as np
 
 from envedit.core import latlong
 from envedit.losses import display_curve
-from envedit.solve.likelihood import INDEPENDENT, SIGMA
+from envedit.solve.likelihood import INDEPENDENT, SIGMA, sizes
 from envedit.transport.light_transport import LightTransport
 
 TURNS_RENDERED, TURNS_APART_TEXELS = 3, 4
@@ -143,8 +143,7 @@ def apart(rendering: np.ndarray, picture: np.ndarray, weight: np.ndarray) -> flo
     ``rendering`` and ``picture`` (h, w, 3) are linear radiance; ``weight`` (h, w, 1): how much each pixel
     counts.
     """
-    size = np.sqrt(np.square(residuals(rendering, picture)).mean(axis=2, keepdims=True))
-    mean = (size * weight).mean() / max(float(weight.mean()), 1e-30)
+    mean = (sizes(residuals(rendering, picture)) * weight).mean() / max(float(weight.mean()), 1e-30)
     return float(mean) if np.isfinite(mean) else np.inf
 
 

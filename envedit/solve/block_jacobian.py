@@ -65,24 +65,23 @@ class BlockJacobian:
     def jacobian(self, slopes: np.ndarray) -> list[np.ndarray]:
         """Return the change of a block's radiance by each node, (blocks, n), per channel."""
         channels = []
-        for c in range(3):
-            sky = np.bincount(self._cell, self._omega * slopes[:, c], self._cells) / np.maximum(
-                self._total, 1e-30
-            )
-            hats = tensor(sky[self._used, None].astype(np.float32) * self._hats)
-            channels.append(dr.matmul(self._tensors[c], hats).numpy())
+        for c, matrix in enumerate(self._tensors):
+            hats = tensor(self._means(slopes[:, c])[:, None] * self._hats)
+            channels.append(dr.matmul(matrix, hats).numpy())
         return channels
 
     def pictures(self, changes: np.ndarray) -> np.ndarray:
         """Return what changes of the active rows, (k, rows, W, 3), do to every pixel: (k, pixels, 3)."""
         of_pixels = np.empty((3, len(changes), len(self.block_of)), np.float32)
         for c, matrix in enumerate(self._matrix):
-            sums = np.stack(
-                [np.bincount(self._cell, self._omega * one[..., c].ravel(), self._cells) for one in changes]
-            )
-            cells = (sums / np.maximum(self._total, 1e-30))[:, self._used]
-            np.take(cells.astype(np.float32) @ matrix.T, self.block_of, axis=1, out=of_pixels[c])
+            cells = np.stack([self._means(one[..., c].ravel()) for one in changes], axis=1)
+            np.take(cells.T @ matrix.T, self.block_of, axis=1, out=of_pixels[c])
         return of_pixels.transpose(1, 2, 0)
+
+    def _means(self, values):
+        """Return the means over the cells in use of values of texels, (rows * W,), float32."""
+        sums = np.bincount(self._cell, self._omega * values, self._cells)
+        return (sums / np.maximum(self._total, 1e-30))[self._used].astype(np.float32)
 
     def profile(self, picture: np.ndarray) -> np.ndarray:
         """Return a picture (h, w, 3) over its mean in every block; 1 where that is 0."""

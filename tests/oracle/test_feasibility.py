@@ -129,6 +129,14 @@ def test_a_map_that_is_known_is_within_reach_whatever_the_solution_finds(dense, 
     assert feasibility.reachable(dense, envmap, target, known=envmap).share == 0
 
 
+def test_what_is_called_after_every_step_may_end_the_search(dense, envmap):
+    def stop():
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        feasibility.reachable(dense, envmap, 2 * render(dense, envmap), after_step=stop)
+
+
 def test_share_is_of_display_values_in_the_painted_region(dense, envmap, rng):
     initial, painted = render(dense, envmap), rng.random(PIXELS)
     target = initial * np.where(rng.random((*PIXELS, 1)) < 0.5, 0.5, 1.4)

@@ -32,7 +32,7 @@ from envedit.scene.scene import Scene
 from envedit.solve import adam_loop, adam_solver, initialization, sky_factor, turning
 from envedit.solve.edit_state import EditState, Watch
 from envedit.solve.layers_solver import LayersSolver
-from envedit.solve.likelihood import INDEPENDENT
+from envedit.solve.likelihood import INDEPENDENT, sizes
 from envedit.solve.search import STRONG_EVIDENCE
 from envedit.targets.target import Target
 
@@ -246,9 +246,9 @@ class Preparation:
             with self.clock("start_s"):
                 params, run = self._explained(layers, octaves, notes, recordings.transport)
             layers.params = params
-            detailed = bool(octaves)
-            octaves = octaves and self._finer(job, params, recordings, notes)
-            layers.coarse = detailed and not octaves
+            if octaves:
+                octaves = self._finer(job, params, recordings, notes)
+                layers.coarse = not octaves
             if job.newton and not octaves:
                 layers.begun = run
 
@@ -376,10 +376,8 @@ def _misfits(rendering, picture, weight):
 
     Of areas, as many as residuals are independent, noise is smaller, and a small change of the light is not.
     """
-    off = turning.residuals(rendering, picture)
-    if weight is not None:
-        off = off * weight / weight.mean(dtype=np.float64)
+    off = turning.residuals(rendering, picture) * weight / weight.mean(dtype=np.float64)
     height, width, _ = off.shape
     across = math.isqrt(INDEPENDENT)
     parts = off, resampling.fit(off, min(across, height), min(across, width))
-    return [float(np.sqrt(np.square(part).mean(axis=2)).mean()) for part in parts]
+    return [float(sizes(part).mean()) for part in parts]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import drjit as dr
@@ -34,6 +35,6 @@ def relit(chosen: config.Scene, envmap: np.ndarray, file: Path) -> Path:
     """Write a scene under a map (H, W, 3), radiance that reaches the scene, to NAME.xml and NAME.exr."""
     map_file = file.with_suffix(".exr")
     images.write_exr(map_file, envmap)
-    text = scenes.relit(chosen.file, map_file.name, dict(chosen.parameters), None, chosen.up, 1.0)
+    text = scenes.relit(replace(chosen, scale=1.0), map_file.name)
     file.write_text(text, encoding="utf-8")
     return file

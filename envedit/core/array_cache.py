@@ -142,6 +142,11 @@ def holds(arrays: dict[str, np.ndarray], expected: dict[str, tuple]) -> bool:
     )
 
 
+def under(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
+    """Return the arrays whose names have a prefix, by the rest of their names."""
+    return {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
+
+
 def _private(folder):
     """Return whether only this user (and the system's) can have written into a folder; True of none."""
     try:

@@ -149,14 +149,14 @@ class Ssim:
 class StackedSsim:
     r"""Structural similarity of pictures below each other: no window crosses from one to the next.
 
-    ``sum_k s_k (1 - SSIM_k)``, where s_k is picture k's share of the weight, or of the pixels; ``rows`` are
-    those of each picture, from the top, without gaps.
+    ``sum_k s_k (1 - SSIM_k)``, where s_k is picture k's share of the weight; ``rows`` are those of each
+    picture, from the top, without gaps.
     """
 
-    def __init__(self, reference: Tensor, weight: Tensor | None, rows: Views):
+    def __init__(self, reference: Tensor, weight: Tensor, rows: Views):
         self._rows = rows
-        self._parts = [Ssim(reference[some], None if weight is None else weight[some]) for some in rows]
-        masses = [some.stop - some.start if weight is None else total(weight[some].array)[0] for some in rows]
+        self._parts = [Ssim(reference[some], weight[some]) for some in rows]
+        masses = [total(weight[some].array)[0] for some in rows]
         mass = max(sum(masses), 1e-30)
         self._shares = [dr.opaque(type(reference.array), float(part / mass)) for part in masses]
 

@@ -76,7 +76,7 @@ def write_scene(folder: Path, result: results.Result) -> list[str]:
             edited, "edited_sky.exr", lights, result.to_world, result.input_map.scale, below
         )
         atomic_files.write_atomically(folder / "edited.usda", stage.encode())
-        text = scene.relit(chosen.file, edited, dict(chosen.parameters), result.base, chosen.up, chosen.scale)
+        text = scene.relit(chosen, edited, result.base)
     except InputError as error:  # the scene's files may be gone by now
         return [f"edited.xml or edited.usda is not written: {error}"]
     atomic_files.write_atomically(folder / "edited.xml", text.encode())

@@ -60,7 +60,7 @@ def inputs_of(settings: config.Config, base: Path | None = None) -> Iterator[Fil
     yield from filter(None, (weights.vgg, weights.dists, weights.backbone, weights.heads))
     from envedit.scene import scene
 
-    yield from scene.files(settings.scene.file, settings.scene.parameters, base)
+    yield from scene.files(settings.scene, base)
 
 
 def tidy(folder: Path) -> None:

@@ -32,6 +32,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from envedit import config
 from envedit.config.validators import meant
 from envedit.core import installed_plugins, latlong, shipped
 from envedit.core.color import tonemap
@@ -431,14 +432,7 @@ def _parsed(file, parameters, base):
     return _Parsed(config, state, path, where, folders, notes)
 
 
-def relit(
-    file: FilePath,
-    envmap: str,
-    parameters: Mapping[str, object] | None = None,
-    base: FilePath | None = None,
-    up: str = "auto",
-    scale: float | str = "auto",
-) -> str:
+def relit(chosen: config.Scene, envmap: str, base: FilePath | None = None) -> str:
     """Return the XML of a scene under another map, otherwise as its author has it; errors as of :func:`load`.
 
     Film, sampler, integrator and all sensors stay; parameters are filled in, files named by absolute paths,
@@ -446,10 +440,10 @@ def relit(
     emitter becomes an ``envmap`` of the file ``envmap``, as it shall stand in the XML, with the rotation and
     ``scale`` of :func:`load`, or one is added; a scene without an integrator gets ``path``.
     """
-    parsed = _parsed(file, parameters, base)
+    parsed = _parsed(chosen.file, dict(chosen.parameters), base)
     state, where, folders = parsed.state, parsed.where, parsed.folders
-    own = supported.own_map(state, where, folders, scale)
-    emitter, _, _ = parser.replace_environment(state, where, up)
+    own = supported.own_map(state, where, folders, chosen.scale)
+    emitter, _, _ = parser.replace_environment(state, where, chosen.up)
     _change_nodes(state, where, folders)
     emitter["filename"] = envmap
     emitter["scale"] = own.scale
@@ -478,19 +472,19 @@ def find(file: FilePath) -> Path:
     raise InputError(f"scene {file}: no such file; {hint}")
 
 
-def files(file: FilePath, parameters: Mapping[str, object], base: FilePath | None = None) -> list[Path]:
+def files(chosen: config.Scene, base: FilePath | None = None) -> list[Path]:
     """List what a scene may read, itself included: every file that it names, in every folder of :func:`load`.
 
     Nothing is built. A scene that cannot be read has itself only.
     """
-    path = Path(file).absolute()
+    path = Path(chosen.file).absolute()
     sources: tuple[str, ...] = ()
     try:
-        text = path = find(file)
+        text = path = find(chosen.file)
         if usd.is_usd(path):
             converted = usd.kept(path)
             text, sources = converted.xml, converted.sources
-        outline = scene_text.read(text, _as_text(parameters))
+        outline = scene_text.read(text, _as_text(chosen.parameters))
     except EnveditError:
         return [path]
     folders = text.parent, Path(base or ".").absolute(), *outline.folders

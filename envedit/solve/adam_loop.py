@@ -17,7 +17,7 @@ import mitsuba as mi
 import numpy as np
 
 from envedit import config
-from envedit.core.arrays import tensor
+from envedit.core.arrays import flat, tensor
 from envedit.core.errors import NumericalError
 from envedit.core.types import Params, Views
 from envedit.losses import losses, optimizer
@@ -42,7 +42,7 @@ class Objective:
         A number or a (start, end) ramp for every term; terms of weight 0 are not computed.
     picture : ndarray (h, w, 3)
         Target, linear radiance.
-    pixel_weight : ndarray (h, w, 1) or None
+    pixel_weight : ndarray (h, w, 1)
         How much each pixel counts.
     original : ndarray (rows, W, 3)
         The active rows of the original map.
@@ -61,7 +61,7 @@ class Objective:
         self,
         weights: config.Loss,
         picture: np.ndarray,
-        pixel_weight: np.ndarray | None,
+        pixel_weight: np.ndarray,
         original: np.ndarray,
         iterations: int,
         dists: distances.Dists = None,
@@ -75,7 +75,7 @@ class Objective:
             if value and (name != "dists" or dists)
         }
         self._target = dr.opaque(to_display(tensor(picture)))
-        self._weight = None if pixel_weight is None else tensor(pixel_weight)
+        self._weight = tensor(pixel_weight)
         self._original = tensor(original)
         self._ssim: Ssim | StackedSsim
         if len(views) > 1:
@@ -136,32 +136,14 @@ class State:
 
 
 def place_rows(original: mi.TensorXf, crop: mi.TensorXf, first: int) -> mi.TensorXf:
-    """Replace rows ``first`` ... of a map (H, W, 3) by ``crop``, differentiably in the crop."""
-    if crop.shape[0] == original.shape[0]:
-        return crop
-    return dr.custom(_PlaceRows, crop, dr.detach(original), first * original.shape[1] * 3)
+    """Replace rows ``first`` ... of a map (H, W, 3) by ``crop``, differentiably in the crop.
 
-
-class _PlaceRows(dr.CustomOp):
-    """The gradient of the crop is a slice.
-
-    Written out, because the adjoint of ``dr.gather`` adds with atomics, which drop NaN on LLVM: a bad step
-    would look good.
+    The gradient of the crop is a slice, in which NaN shows: a sum with atomics drops it on LLVM.
     """
-
-    def eval(self, crop, original, start):
-        self.start, self.shape = dr.opaque(mi.UInt32, start), crop.shape
-        i = dr.arange(mi.UInt32, len(original.array))
-        inside = (i >= self.start) & (i < self.start + len(crop.array))
-        edited = dr.gather(mi.Float, crop.array, i - self.start, inside)
-        return mi.TensorXf(dr.select(inside, edited, original.array), original.shape)
-
-    def backward(self):
-        index = dr.arange(mi.UInt32, self.shape[0] * self.shape[1] * 3) + self.start
-        self.set_grad_in("crop", mi.TensorXf(dr.gather(mi.Float, self.grad_out().array, index), self.shape))
-
-    def name(self):
-        return "place rows"
+    last = first + crop.shape[0]
+    above = [original[:first]] if first > 0 else []
+    below = [original[last:]] if last < original.shape[0] else []
+    return dr.concat([*above, crop, *below])
 
 
 class _Slopes:
@@ -196,17 +178,6 @@ class _Slope(dr.CustomOp):
 
     def name(self):
         return "finite gradient"
-
-
-class _Keep:
-    """Put a map's own texels, (rows, W, 3), where it may not change; differentiable in the crop."""
-
-    def __init__(self, original, free):
-        self._original = dr.opaque(mi.Float(np.ascontiguousarray(original, np.float32).ravel()))
-        self._free = dr.opaque(mi.Bool(np.repeat(free.ravel(), 3)))
-
-    def __call__(self, crop):
-        return mi.TensorXf(dr.select(self._free, crop.array, self._original), crop.shape)
 
 
 def adam_for(representation: Representation, params: Params, settings: config.Optimizer) -> optimizer.Adam:
@@ -269,13 +240,17 @@ def optimise(
     """
     adam, state = adam or adam_for(representation, params, settings), state or State()
     fixed = tensor(envmap)
-    keep = _Keep(envmap[first_row : first_row + len(free)], free) if free is not None else None
+    if free is not None:
+        original = flat(mi.Float, np.float32(envmap[first_row : first_row + len(free)]))
+        changes = flat(mi.Bool, np.repeat(free, 3))
     while state.step < settings.iterations:
         start = time.perf_counter()
         leaves, slopes = adam.leaves(), _Slopes()
         with dr.isolate_grad():
             crop = representation.decode(leaves)
-            crop = slopes.pass_on(keep(crop) if keep else crop)
+            if free is not None:
+                crop = mi.TensorXf(dr.select(changes, crop.array, original), crop.shape)
+            crop = slopes.pass_on(crop)
             rendering = renderer.render(place_rows(fixed, crop, first_row), state.step)
             rendering = slopes.pass_on(rendering)
             total, terms = objective(rendering, crop, state.step)

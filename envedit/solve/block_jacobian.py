@@ -16,15 +16,17 @@ from envedit.transport.light_transport import LightTransport
 
 
 class BlockJacobian:
-    """The block transport with the gain's hats in its cells."""
+    """The block transport with the gain's hats in its cells.
+
+    ``sky`` are the cells of the sky that may change: their numbers in use, and directions (n, 3).
+    """
 
     def __init__(self, layers: Layers, transport: LightTransport, shape: tuple[int, int]):
         overview = transport.overview()
         self.block_of, self.count = overview.block_of, overview.blocks
         active = slice(layers.active.start * shape[1], layers.active.stop * shape[1])
-        self._shape, self._own = layers.whole, layers.shape[0] * layers.shape[1]
+        self._shape = layers.whole
         cells, omega = overview.cells, np.repeat(latlong.lookup_solid_angles(*shape), shape[1])
-        self._directions = overview.directions
         # Pixels in the order of their blocks, where each block begins, and which these are.
         self._order = np.argsort(self.block_of, kind="stable")
         ordered = self.block_of[self._order]
@@ -32,7 +34,6 @@ class BlockJacobian:
         self._present = ordered[self._starts]
         self._total = overview.omega
         self._cell, self._omega, self._cells = overview.cell_of[active], omega[active], cells
-        self._changeable = (self._omega.reshape(*self._shape, 1) * layers.changeable).ravel()
         # Hats are weighed by the sky's luminance: what is bright in a cell determines its gain.
         sky = np.maximum(layers.background().reshape(-1, 3) @ LUMINANCE, 1e-12) * self._omega
         light = np.maximum(np.bincount(self._cell, sky, cells), 1e-30)
@@ -54,28 +55,33 @@ class BlockJacobian:
         self._hats = np.concatenate(hats, axis=1)[used].astype(np.float32)
         self._matrix = [np.ascontiguousarray(m[:, used]) for m in overview.matrix]
         self._tensors = [tensor(m) for m in self._matrix]
+        # Cells that are more than half full of texels above the horizon that may change.
+        texels = slice(layers.shape[0] * shape[1])
+        changeable = (self._omega.reshape(*self._shape, 1) * layers.changeable).ravel()
+        inside = np.bincount(self._cell[texels], changeable[texels], cells)
+        in_sky = np.flatnonzero(inside[used] > 0.5 * self._total[used])
+        self.sky = in_sky, overview.directions[self._used[in_sky]]
 
     def jacobian(self, slopes: np.ndarray) -> list[np.ndarray]:
         """Return the change of a block's radiance by each node, (blocks, n), per channel."""
         channels = []
-        for c in range(3):
-            sky = np.bincount(self._cell, self._omega * slopes[:, c], self._cells) / np.maximum(
-                self._total, 1e-30
-            )
-            hats = tensor(sky[self._used, None].astype(np.float32) * self._hats)
-            channels.append(dr.matmul(self._tensors[c], hats).numpy())
+        for c, matrix in enumerate(self._tensors):
+            hats = tensor(self._means(slopes[:, c])[:, None] * self._hats)
+            channels.append(dr.matmul(matrix, hats).numpy())
         return channels
 
     def pictures(self, changes: np.ndarray) -> np.ndarray:
         """Return what changes of the active rows, (k, rows, W, 3), do to every pixel: (k, pixels, 3)."""
         of_pixels = np.empty((3, len(changes), len(self.block_of)), np.float32)
         for c, matrix in enumerate(self._matrix):
-            sums = np.stack(
-                [np.bincount(self._cell, self._omega * one[..., c].ravel(), self._cells) for one in changes]
-            )
-            cells = (sums / np.maximum(self._total, 1e-30))[:, self._used]
-            np.take(cells.astype(np.float32) @ matrix.T, self.block_of, axis=1, out=of_pixels[c])
+            cells = np.stack([self._means(one[..., c].ravel()) for one in changes], axis=1)
+            np.take(cells.T @ matrix.T, self.block_of, axis=1, out=of_pixels[c])
         return of_pixels.transpose(1, 2, 0)
+
+    def _means(self, values):
+        """Return the means over the cells in use of values of texels, (rows * W,), float32."""
+        sums = np.bincount(self._cell, self._omega * values, self._cells)
+        return (sums / np.maximum(self._total, 1e-30))[self._used].astype(np.float32)
 
     def profile(self, picture: np.ndarray) -> np.ndarray:
         """Return a picture (h, w, 3) over its mean in every block; 1 where that is 0."""
@@ -84,14 +90,6 @@ class BlockJacobian:
         mean = (self.summed(flat.reshape(picture.shape)) / np.maximum(size, 1)[:, None])[self.block_of]
         profile = np.divide(flat, mean, out=np.ones_like(flat), where=mean > 0)
         return profile.astype(np.float32).reshape(picture.shape)
-
-    @functools.cached_property
-    def sky(self) -> tuple[np.ndarray, np.ndarray]:
-        """Cells of the sky that may change: their numbers in use, and directions (n, 3)."""
-        own = self._cell[: self._own]
-        inside = np.bincount(own, self._changeable[: len(own)], self._cells)
-        cells = np.flatnonzero(inside[self._used] > 0.5 * self._total[self._used])
-        return cells, self._directions[self._used[cells]]
 
     @functools.cached_property
     def _lit(self):

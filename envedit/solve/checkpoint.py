@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from envedit import config
+from envedit.core.array_cache import under
 from envedit.core.atomic_files import opened, replacing
 from envedit.core.errors import InputError
 from envedit.core.types import FilePath
@@ -58,20 +59,9 @@ def load(folder: Path, what: str) -> tuple[State, dict, dict, np.ndarray] | None
     if not os.path.lexists(path):
         return None
     try:
-        # Opened here: np.load leaves a file open that is no archive.
-        with opened(path) as file, np.load(file) as stored:
-            meta, picture = json.loads(stored["meta"].tobytes()), stored["target"]
-            parts = {
-                part: {
-                    k.removeprefix(f"{part}/"): stored[k] for k in stored.files if k.startswith(f"{part}/")
-                }
-                for part in ("optimiser", "renderer")
-            }
-        if not all(
-            isinstance(a, np.ndarray)
-            for a in (picture, *parts["optimiser"].values(), *parts["renderer"].values())
-        ):
-            raise ValueError("an entry is no array")  # numpy gives the bytes of such an entry
+        arrays = _arrays(path)
+        meta, picture = json.loads(arrays["meta"].tobytes()), arrays["target"]
+        optimiser, renderer = under(arrays, "optimiser/"), under(arrays, "renderer/")
         state, stored_digest = State(**meta["state"]), meta["digest"]
         whole = state.step, state.bad_steps, state.bad_in_a_row
         if not (
@@ -81,7 +71,7 @@ def load(folder: Path, what: str) -> tuple[State, dict, dict, np.ndarray] | None
             and isinstance(state.history, list)
             and all(isinstance(row, dict) for row in state.history)
             and picture.dtype == np.float32
-            and all(np.isfinite(a).all() for a in (picture, *parts["optimiser"].values()))
+            and all(np.isfinite(a).all() for a in (picture, *optimiser.values()))
         ):
             raise ValueError("what it holds is no state of a run")
     except Exception as error:  # what zipfile, zlib and numpy make of damage has many names
@@ -95,7 +85,7 @@ def load(folder: Path, what: str) -> tuple[State, dict, dict, np.ndarray] | None
             f"{path}: belongs to another configuration or other input files, or to an older envedit: "
             "run without --resume to start afresh"
         )
-    return state, parts["optimiser"], parts["renderer"], picture
+    return state, optimiser, renderer, picture
 
 
 def save_solution(path: Path, run: gauss_newton.Run) -> None:
@@ -115,8 +105,7 @@ def load_solution(path: FilePath, like: dict[str, np.ndarray]) -> gauss_newton.R
     """
     remedy = "save again in `envedit paint`, or leave [optimizer] start out"
     try:
-        with opened(Path(path)) as file, np.load(file) as stored:
-            run = gauss_newton.Run.of_arrays({name: stored[name] for name in stored.files}, [])
+        run = gauss_newton.Run.of_arrays(_arrays(Path(path)), [])
     except Exception as error:  # what zipfile, zlib and numpy make of damage has many names
         reason = ascii(" ".join(str(error).split())[:160])
         raise InputError(f"{path}: the solution cannot be read ({reason}): {remedy}") from error
@@ -125,6 +114,16 @@ def load_solution(path: FilePath, like: dict[str, np.ndarray]) -> gauss_newton.R
         if not same or not all(np.isfinite(array).all() for array in one.values()):
             raise InputError(f"{path}: is the solution of another map or another configuration: {remedy}")
     return gauss_newton.Run(run.state, run.start, hold=max(1.0, float(run.hold)))
+
+
+def _arrays(path):
+    """Return the arrays of an npz file by name; many kinds of errors if it is none."""
+    # Opened here: np.load leaves a file open that is no archive.
+    with opened(path) as file, np.load(file) as stored:
+        arrays = {name: stored[name] for name in stored.files}
+    if not all(isinstance(array, np.ndarray) for array in arrays.values()):
+        raise ValueError("an entry is no array")  # numpy gives the bytes of such an entry
+    return arrays
 
 
 def remove(folder: Path) -> None:

@@ -51,24 +51,25 @@ class Linearisation:
 class Derivatives:
     """Derivatives of the renderings of some unknowns; those of the last point are kept.
 
-    ``blocks`` is T of blocks of pixels; ``angle`` is the rotation of the finite difference by a light's
-    direction, radians.
+    ``blocks`` is T of blocks of pixels.
     """
 
     def __init__(self, unknowns: Unknowns, blocks: BlockJacobian):
         self.unknowns, self.blocks = unknowns, blocks
         self.layers = unknowns.layers
         self.rows = self.layers.active
-        self.angle = NARROW_ANGLE
         self._last: tuple[np.ndarray, float, Linearisation] | None = None
 
-    def at(self, point: Point) -> Linearisation:
-        """Return the derivatives at a point, which must be finite; they depend on no target and no weight."""
-        if self._last is None or self._last[0] is not point.rendering or self._last[1] != self.angle:
-            pictures, named, profile, maps = self._lights(point)
+    def at(self, point: Point, angle: float = NARROW_ANGLE) -> Linearisation:
+        """Return the derivatives at a point, which must be finite; they depend on no target and no weight.
+
+        ``angle`` is the rotation of the finite difference by a light's direction, radians.
+        """
+        if self._last is None or self._last[0] is not point.rendering or self._last[1] != angle:
+            pictures, named, profile, maps = self._lights(point, angle)
             jacobian = self.blocks.jacobian(self._slopes(point))
             made = Linearisation(pictures, named, profile, jacobian, maps)
-            self._last = point.rendering, self.angle, made
+            self._last = point.rendering, angle, made
         return self._last[2]
 
     def _slopes(self, point):
@@ -88,7 +89,7 @@ class Derivatives:
             sky -= one.reshape(sky.shape)
         return self.blocks.profile(np.maximum(sky, 0))
 
-    def _lights(self, point):
+    def _lights(self, point, angle):
         """Return derivatives by lights and saturation, what these are, the profile, and those of the map."""
         # ---- Cores through T: rendered, and by two angles and by size
         state, layers = point.state, self.layers
@@ -103,12 +104,12 @@ class Derivatives:
             turns = [turn]
             for axis in axes:
                 for sign in (1, -1):
-                    end = rotated(self.unknowns.direction(state, i), sign * self.angle * axis)
+                    end = rotated(self.unknowns.direction(state, i), sign * angle * axis)
                     turns.append(rotation_vector(layers.lights.centres[i], end))
             placements = [(one, flux, size) for one in turns]
             placements.append((turn, flux, size + SIZE_STEP))
             core, *ends, larger = layers.cores_of(i, placements)
-            cores = np.stack([core, *self._differences(ends), (larger - core) / SIZE_STEP])
+            cores = np.stack([core, *_differences(ends, angle), (larger - core) / SIZE_STEP])
             pictures = point.transport.pictures(cores, self.rows, most).reshape(4, -1, 3)
             lights.append((i, turns, cores, pictures))
             names += [*(("turn", i, axis) for axis in axes), ("size", i, 0)]
@@ -124,7 +125,7 @@ class Derivatives:
             if log_glow is not None:
                 # d log(1 + f G) / d log f is f G / (1 + f G), which is 1 - 1 / (1 + f G)
                 by_flux = -np.expm1(-log_glow) * log_strength_slope(flux_factor(state["flux"][i]))
-                by_turn = (slope * one for one in self._differences(ends))
+                by_turn = (slope * one for one in _differences(ends, angle))
                 change = np.stack([slope * by_flux, *by_turn])
             change = self._with_lit_ground(point, cores[:3], change)
             if change is not None:
@@ -193,6 +194,7 @@ class Derivatives:
         across = across / length if length > 1e-6 else np.array([1.0, 0, 0])
         return across, np.cross(across, centre)
 
-    def _differences(self, ends):
-        """Return derivatives by two angles of what is given ahead and back along each."""
-        return [(ends[k] - ends[k + 1]) / (2 * self.angle) for k in (0, 2)]
+
+def _differences(ends, angle):
+    """Return derivatives by two angles of what is given ahead and back along each."""
+    return [(ends[k] - ends[k + 1]) / (2 * angle) for k in (0, 2)]

@@ -20,7 +20,7 @@ from envedit.representations.layers.unseen import unseen_kept
 from envedit.scene.scene import Scene
 from envedit.solve import block_jacobian, prior
 from envedit.solve.likelihood import Likelihood
-from envedit.solve.map_problem import Photographed, Problem
+from envedit.solve.map_problem import Problem
 from envedit.targets.target import Target
 from envedit.transport.light_transport import LightTransport
 
@@ -128,6 +128,6 @@ class EditState:
             expected,
             saturates=self.rendered,
             blocks=self._blocks[recording],
-            photo=None if target.photo is None else Photographed.of(target.photo),
+            photo=target.photo,
             clipped=target.clipped,
         )

@@ -23,6 +23,7 @@ compared as well.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,7 +34,7 @@ from envedit.core.rows import Rows
 from envedit.core.seeds import SIGNS
 from envedit.images import map_regions
 from envedit.solve.gain_bandwidth import PROBES
-from envedit.solve.likelihood import STATEMENTS, Likelihood, on_average_one
+from envedit.solve.likelihood import STATEMENTS, Likelihood
 from envedit.transport.block_transport import sky_cells
 from envedit.transport.light_transport import LightTransport
 
@@ -98,6 +99,7 @@ def reachable(
     rendered: np.ndarray | None = None,
     known: np.ndarray | None = None,
     kept: np.ndarray | None = None,
+    after_step: Callable[[], None] = lambda: None,
 ) -> Reach:
     """Find the closest picture that any non-negative map makes.
 
@@ -121,6 +123,8 @@ def reachable(
         A map that answers the request already, such as an edit's: the closest picture is no farther than its.
     kept : ndarray (H, W), optional
         How far texels stay as they are; the light of those that mostly do stays.
+    after_step : callable, optional
+        Called now and then; what it raises ends the search.
 
     Returns
     -------
@@ -137,7 +141,7 @@ def reachable(
     active[slice(None) if rows is None else rows.slice] = True
     if kept is not None:
         active &= kept < map_regions.KEPT_SHARE
-    likelihood = likelihood or Likelihood(on_average_one(None, transport.shape))
+    likelihood = likelihood or Likelihood(np.ones((*transport.shape, 1), np.float32))
     painted = likelihood.weight[..., 0] > 0 if painted is None else painted
     transport = transport.resolved(original)
     initial = _rendering(transport, original)
@@ -152,7 +156,7 @@ def reachable(
     # ---- The closest of the original's picture, the solution's, and that of the map that is known
     candidates = [(original, initial)]
     if distance > 0 and (transport.influence[active] > 0).any():
-        candidates.append(_solution(transport, original, active, request))
+        candidates.append(_solution(transport, original, active, request, after_step))
     if distance > 0 and known is not None:
         transport = transport.resolved(known)
         candidates.append((known, _rendering(transport, known)))
@@ -233,7 +237,7 @@ def _cells(transport, shape):
     return np.unique(groups, return_inverse=True)[1].reshape(shape)
 
 
-def _solution(transport, original, active, request):
+def _solution(transport, original, active, request, after_step):
     """Solve the convex problem, anew where its solution leads; returns the map and its rendering."""
     groups = _cells(transport, original.shape[:2])
     size = np.bincount(groups.ravel())[:, None]
@@ -291,6 +295,7 @@ def _solution(transport, original, active, request):
             momentum = np.where(uphill, 1, following)
             z, z_light = new + ahead * (new - x), new_light + ahead * (new_light - light)
             x, light = new, new_light
+            after_step()
     envmap = np.where(active, radiance(x), original).astype(np.float32)
     return envmap, _rendering(transport, envmap)
 

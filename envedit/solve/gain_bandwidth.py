@@ -41,7 +41,7 @@ def octaves(
     background: np.ndarray,
     rows: tuple[int, int],
     picture: np.ndarray,
-    weight: np.ndarray | None,
+    weight: np.ndarray,
     coarsest: int,
 ) -> list[Octave]:
     """Measure the octaves of detail that a picture determines.
@@ -56,7 +56,7 @@ def octaves(
         First active row, rows of the map.
     picture : ndarray (h, w, 3)
         The target, linear radiance.
-    weight : ndarray (h, w, 1), optional
+    weight : ndarray (h, w, 1)
         How much each pixel counts.
     coarsest : int
         Cycles of the coarsest octave asked about; each further one has twice as many, up to one node a texel.
@@ -68,9 +68,7 @@ def octaves(
         :data:`LEAST_SHARE`).
     """
     height, width, _ = background.shape
-    slope = display_curve.slope(picture) / SIGMA
-    if weight is not None:
-        slope = slope * np.sqrt(weight)
+    slope = display_curve.slope(picture) / SIGMA * np.sqrt(weight)
     omega = latlong.solid_angles(rows[1], width)[rows[0] : rows[0] + height]
     identified: list[Octave] = []
     cycles = coarsest

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from envedit.core.array_cache import under
 from envedit.core.errors import NumericalError
 from envedit.solve.derivatives import NARROW_ANGLE, WIDE_ANGLE
 from envedit.solve.map_problem import Point, Posterior, Problem
@@ -54,6 +55,11 @@ class Run:
     wide: bool = False
     corrected: bool = False  # the last steps, towards a target without T's error (:mod:`.layers_solver`)
 
+    @property
+    def angle(self) -> float:
+        """Rotation of the differences by a light's direction, radians."""
+        return WIDE_ANGLE if self.wide else NARROW_ANGLE
+
     def onward(self, **changes: Any) -> Run:
         """Return another run, with the defaults but for changes, that goes on from where this one is."""
         return Run(self.state, self.start, history=list(self.history), columns=self.columns, **changes)
@@ -70,15 +76,11 @@ class Run:
     @classmethod
     def of_arrays(cls, arrays: dict[str, np.ndarray], history: list[dict]) -> Run:
         """Make a run of what :meth:`arrays` returned."""
-        state, start = (
-            {k.removeprefix(f"{part}."): v for k, v in arrays.items() if k.startswith(f"{part}.")}
-            for part in ("state", "start")
-        )
         damping, scale, finished, most, hold, wide, corrected = arrays["numbers"].tolist()
         columns = arrays.get("columns")
         return cls(
-            state=state,
-            start=start,
+            state=under(arrays, "state."),
+            start=under(arrays, "start."),
             damping=damping,
             scale=scale or np.inf,
             finished=bool(finished),
@@ -198,18 +200,18 @@ def descended(
         run.scale = min(run.scale, max(noise, halved))
 
         # ---- F linearised
-        normal = _linearised(problem, run, point)
+        normal = problem.normal(point, run.start, run.scale, run.angle)
 
         # ---- A step that lowers F, where one may by enough
-        before, better, promised = problem.loss(point, run.start, run.scale), None, normal.decrement
+        better, promised = None, normal.decrement
         if hopeless and hopeless(point, (most - len(run.history)) * promised):
             break
-        if promised >= LEAST_DECREASE * before:
-            point, before, better = _lower(problem, run, point, normal)
-        loss = before if better is None else better.loss
+        if promised >= LEAST_DECREASE * problem.loss(point, run.start, run.scale):
+            point, better = _lower(problem, run, point, normal)
 
         # ---- Whether it is the last one
-        little = better is None or before - loss < LEAST_DECREASE * before
+        before, after = (problem.loss(one, run.start, run.scale) for one in (point, better or point))
+        little = better is None or before - after < LEAST_DECREASE * before
         ended = little and run.scale <= 1.01 * problem.likelihood.noise(point.residual, largest_noise)
         run.finished = ended and (run.wide or not problem.shining(run.state))
         if ended and not run.wide:  # other derivatives: what damping those needed says nothing of them
@@ -217,15 +219,15 @@ def descended(
 
         # ---- Taken, and noted
         if better is not None:
-            point = better.point
+            point = better
             run.state = point.state
             run.damping = max(run.damping / DAMPING_FACTOR, LEAST_DAMPING)
             run.history.append(
                 {
                     "iteration": len(run.history),
-                    "loss": better.loss,
-                    "data": better.misfit,
-                    "prior": better.penalty,
+                    "loss": after,
+                    "data": problem.likelihood.misfit(point.residual, run.scale),
+                    "prior": problem.penalty(point, run.start),
                     "sigma": run.scale,
                     "residual": float(np.sqrt(np.square(point.residual).mean())),
                     "damping": run.damping,
@@ -238,53 +240,38 @@ def descended(
     return point
 
 
-def _linearised(problem, run, point, bounded=False):
-    """Return the normal equations of a run's next step; ``bounded`` as of :meth:`.Problem.normal`."""
-    problem.derivatives.angle = WIDE_ANGLE if run.wide else NARROW_ANGLE
-    normal = problem.normal(point, run.start, run.scale, bounded=bounded)
-    problem.derivatives.angle = NARROW_ANGLE
-    return normal
-
-
-@dataclass(frozen=True)
-class _Trial:
-    """A point that a step leads to, and the two parts of F there."""
-
-    point: Point
-    misfit: float
-    penalty: float
-
-    @property
-    def loss(self):
-        return self.misfit + self.penalty
-
-
 def _lower(problem, run, point, normal):
     """Try steps of more and more damping until one lowers F.
 
-    Returns the point that the run is at, F there, and the trial that is lower, or None. The point may have
-    been rendered anew, with the columns of T that a trial has more. F does not depend on how white the sky is
-    until more of it is white than was: from the first trial on where it is, the equations count that.
+    Returns the point that the run is at, as of :func:`_tried`, and the one that is lower, or None. F does not
+    depend on how white the sky is until more of it is white than was: from the first step on that leads
+    there, the equations count that.
     """
-    before = problem.loss(point, run.start, run.scale)
     bounded = False
-    tried = 0
-    while tried < DAMPINGS_TRIED:
-        state = problem.step(run.state, normal, run.damping)
-        there = None if state is None else problem.evaluate(state, point.transport)
-        if there is not None and there.residual is not None:
-            misfit = problem.likelihood.misfit(there.residual, run.scale)
-            trial = _Trial(there, misfit, problem.penalty(there, run.start))
-            if trial.loss >= before:
-                again = problem.evaluate(run.state, there.transport, resolve=False)
-                if again.residual is not None:
-                    point, before = again, problem.loss(again, run.start, run.scale)
-            if trial.loss < before:
-                return point, before, trial
-            if not bounded and not problem.whitens(point) and problem.whitens(there):
-                bounded = True
-                normal = _linearised(problem, run, point, bounded)
-                continue
+    for _ in range(DAMPINGS_TRIED):
+        point, there, lower = _tried(problem, run, point, normal)
+        if there and not (lower or bounded) and problem.whitens(there) and not problem.whitens(point):
+            bounded = True
+            normal = problem.normal(point, run.start, run.scale, run.angle, bounded=True)
+            point, there, lower = _tried(problem, run, point, normal)
+        if lower:
+            return point, there
         run.damping = max(DAMPING_FACTOR * run.damping, RAISED_DAMPING)
-        tried += 1
-    return point, before, None
+    return point, None
+
+
+def _tried(problem, run, point, normal):
+    """Make one step; returns where it is from, where it leads, or None, and whether F is lower there.
+
+    Where it is not, the former is rendered anew, with the columns of T that the latter has more.
+    """
+    state = problem.step(run.state, normal, run.damping)
+    there = None if state is None else problem.evaluate(state, point.transport)
+    if there is None or there.residual is None:
+        return point, None, False
+    before, after = (problem.loss(one, run.start, run.scale) for one in (point, there))
+    if after >= before:
+        again = problem.evaluate(run.state, there.transport, resolve=False)
+        if again.residual is not None:
+            point, before = again, problem.loss(again, run.start, run.scale)
+    return point, there, after < before

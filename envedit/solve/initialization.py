@@ -120,7 +120,7 @@ def trusted(envmap: np.ndarray, recordings: Recordings, target: Target) -> tuple
         return target, []
     noisy = 100 * float((weight < 0.5).mean())
     note = f"{noisy:.3g} % of the pixels are dominated by Monte Carlo noise and down-weighted"
-    weight = weight if target.weight is None else weight * target.weight
+    weight = weight * target.weight
     if not weight.any():  # a mask around nothing but noise: better that than nothing
         return target, []
     return replace(target, weight=(weight / max(float(weight.mean()), 1e-30)).astype(np.float32)), [note]

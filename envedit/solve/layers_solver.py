@@ -307,8 +307,7 @@ class LayersSolver:
         seed = Seeds(self.edit.settings.seed).step_check
         shown = display_curve.values(self.edit.scene.render(envmap, CHECK_SPP, seed))
         missed = shown - display_curve.values(target.picture)
-        weight = 1 if target.known_weight is None else target.known_weight
-        return float((np.square(missed) * weight).mean())
+        return float((np.square(missed) * target.known_weight).mean())
 
 
 class _Checkpoints:

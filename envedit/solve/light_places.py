@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -103,15 +103,6 @@ def is_apart(direction: np.ndarray, others: list[np.ndarray]) -> bool:
     return all(direction @ other <= PLACES_APART_COSINE for other in others)
 
 
-class _Products(NamedTuple):
-    """Products of n pictures of lights, of strength 1, weighted: what F falls by is made of."""
-
-    mixed: np.ndarray  # (m, n), with the derivatives by the unknowns
-    pull: np.ndarray  # (n,), with the residual
-    power: np.ndarray  # (n,), with themselves
-    mean: np.ndarray  # (3, n), what they do to the mean of what was not painted
-
-
 class Places:
     """Places of lights that are dark at a point, by the problem's normal equations there.
 
@@ -186,11 +177,11 @@ class Places:
         power = cells.power(normal.squared * flux**2).sum(axis=0)
         of_mean = zip(normal.mean_by_blocks.T, flux, strict=True)
         mean = cells.products([b[:, None] * f for b, f in of_mean])
-        return self._best(_Products(np.concatenate(mixed), pull[0], power, np.concatenate(mean)))
+        return self._best(np.concatenate(mixed), pull[0], power, np.concatenate(mean))
 
     def _of_pixels(self, pictures):
         """Return the same for pictures (n, pixels, 3)."""
-        return self._best(self._products(pictures))
+        return self._best(*self._products(pictures))
 
     def _of_channels(self, picture, strengths):
         """Return the best strengths (3,) of a picture (pixels, 3) that has one in each channel.
@@ -198,7 +189,7 @@ class Places:
         At least :data:`FAINTEST` of the strongest; those given, where they have no solution.
         """
         products = self._products(np.float32(picture * np.eye(3)[:, None]))
-        half, along, power = self._reduced(products)
+        half, along, power = self._reduced(*products)
         rest = np.diag((1 + LEAST_UNEXPLAINED) * power) - half.T @ half
         try:
             flux = np.linalg.solve(rest, along)
@@ -209,7 +200,11 @@ class Places:
         return np.maximum(flux, FAINTEST * flux.max())
 
     def _products(self, pictures):
-        """Return the products of pictures (n, pixels, 3)."""
+        """Return the weighted products of pictures (n, pixels, 3) that F falls by.
+
+        With the derivatives by the unknowns (m, n), with the residual and with themselves, (n,) both; and
+        what they do to the mean of what was not painted, (3, n).
+        """
         normal, count = self.normal, len(pictures)
         linear = normal.linear
         known = linear.pictures.reshape(len(linear.pictures), pictures.shape[1], 3)
@@ -221,7 +216,7 @@ class Places:
             mine = np.ascontiguousarray(pictures[..., c])
             slope, robust, residual, profile = (
                 np.broadcast_to(v, normal.slope.shape)[..., c].ravel()
-                for v in (normal.slope, normal.robust, normal.residual, linear.profile)
+                for v in (normal.slope, normal.robust, self.point.residual, linear.profile)
             )
             weighted = mine * np.float32(slope**2 * robust)
             mixed.append(j.T @ self.problem.blocks.sums(weighted * profile).T)
@@ -230,20 +225,17 @@ class Places:
             power = power + np.einsum("np,np->n", mine, weighted)
         by_pixels = normal.mean_by_pixels.reshape(-1, 3)
         mean = np.stack([pictures[..., c] @ by_pixels[:, c] for c in range(3)])
-        return _Products(np.concatenate([*mixed, by_pictures]), pull, power, mean)
+        return np.concatenate([*mixed, by_pictures]), pull, power, mean
 
-    def _reduced(self, products):
+    def _reduced(self, mixed, pull, power, mean):
         """Return L^-1 times the mixed part, the slope beside the other unknowns, and the power."""
-        mean = products.mean
-        mixed = products.mixed + self.normal.mean_by_unknowns.T @ mean
-        pull = products.pull + self.normal.mean @ mean
-        half = forward(self._lower, mixed)
-        along = half.T @ self._gradient - pull
-        return half, along, products.power + np.square(mean).sum(axis=0)
+        half = forward(self._lower, mixed + self.normal.mean_by_unknowns.T @ mean)
+        along = half.T @ self._gradient - (pull + self.normal.mean @ mean)
+        return half, along, power + np.square(mean).sum(axis=0)
 
-    def _best(self, products):
-        """Return strengths and falls of single pictures."""
-        half, along, power = self._reduced(products)
+    def _best(self, mixed, pull, power, mean):
+        """Return strengths and falls of single pictures, by what :meth:`_products` returns of them."""
+        half, along, power = self._reduced(mixed, pull, power, mean)
         rest = power - np.square(half).sum(axis=0)
         strength = np.divide(along, rest, out=np.zeros_like(rest), where=rest > LEAST_UNEXPLAINED * power)
         fall = np.maximum(strength, 0) * along

@@ -77,7 +77,7 @@ class Likelihood:
         rest = (1 - coverage) * (weight > 0)
         white = max(1.0, brightest_shown(initial))
         return cls(
-            weight=on_average_one(weight, weight.shape[:2]),
+            weight=on_average_one(weight),
             independent=STATEMENTS / painted if painted > 0 else STATEMENTS,
             paint_noise=PAINT_NOISE * _painted_change(of_paint, initial, picture, white),
             rest=rest if rest.any() else None,
@@ -91,7 +91,7 @@ class Likelihood:
         Display values have the standard error of the target, at least :data:`SIGMA`.
         """
         if target.coverage is None:
-            likelihood = cls(on_average_one(target.weight, target.picture.shape[:2]))
+            likelihood = cls(on_average_one(target.weight))
         else:
             likelihood = cls.of_paint(target.weight, target.coverage, target.initial, target.picture)
         if target.noise is None:
@@ -200,10 +200,8 @@ def _painted_change(weight, initial, picture, white):
     return float(np.sqrt((weight * size**2).sum() / total)) if total > 0 else VISIBLE
 
 
-def on_average_one(weight: np.ndarray | None, shape: tuple[int, int]) -> np.ndarray:
+def on_average_one(weight: np.ndarray) -> np.ndarray:
     """Return weights (h, w, 1) whose mean is 1: where few pixels count, they are the whole picture."""
-    if weight is None:
-        return np.ones((*shape, 1), np.float32)
     mean = float(np.mean(weight, dtype=np.float64))
     scale = 1.0 if abs(mean - 1) < 1e-6 else 1 / max(mean, 1e-30)
     return np.asarray(weight * scale, np.float32)

@@ -34,8 +34,8 @@ from envedit.core.rotations import rotation_between
 from envedit.losses import display_curve
 from envedit.representations.layers.layers import Layers
 from envedit.solve.block_jacobian import BlockJacobian
-from envedit.solve.derivatives import Derivatives
-from envedit.solve.likelihood import Likelihood, on_average_one
+from envedit.solve.derivatives import NARROW_ANGLE, Derivatives
+from envedit.solve.likelihood import Likelihood
 from envedit.solve.normal_equations import Normal, solved
 from envedit.solve.prior import AXES, Prior
 from envedit.solve.unknowns import LOG_SATURATIONS, Point, Unknowns, in_numpy
@@ -52,20 +52,6 @@ LARGEST_STEP = {
     "camera": 1.0,
 }
 """Largest step of an unknown: beyond it the linear model does not hold."""
-
-
-@dataclass(frozen=True)
-class Photographed:
-    """What a photograph adds to a problem."""
-
-    # (3,), exposure and white balance by which the target has been divided, less what they are drawn to
-    log_factor: np.ndarray
-    precision: np.ndarray  # (3, 3), inverse covariance of their sum, about 0
-
-    @classmethod
-    def of(cls, photo: Photo) -> Photographed:
-        """Return what a photograph adds."""
-        return cls(photo.camera.log_factor - photo.centre, photo.precision)
 
 
 @dataclass(frozen=True)
@@ -108,8 +94,8 @@ class Problem(Unknowns):
         The saturation of its colours is an unknown.
     blocks : BlockJacobian, optional
         Of another problem of these layers and this transport; made where None.
-    photo : Photographed, optional
-        Of a photograph as the target.
+    photo : Photo, optional
+        The photograph that the target is.
     clipped : ndarray of bool (h, w, 3), optional
         Where the target is a lower bound.
     """
@@ -124,7 +110,7 @@ class Problem(Unknowns):
         prior: Prior | None = None,
         saturates: bool = False,
         blocks: BlockJacobian | None = None,
-        photo: Photographed | None = None,
+        photo: Photo | None = None,
         clipped: np.ndarray | None = None,
     ):
         super().__init__(layers, saturates, photo is not None)
@@ -142,7 +128,7 @@ class Problem(Unknowns):
 
     def _aim(self, picture, likelihood):
         self.picture = picture
-        self.likelihood = likelihood or Likelihood(on_average_one(None, picture.shape[:2]))
+        self.likelihood = likelihood or Likelihood(np.ones((*picture.shape[:2], 1), np.float32))
         self.target = display_curve.values(picture, self.likelihood.white)
         unpainted = self.likelihood.unpainted
         self.white_sky = WhiteSky.of(self.envmap, unpainted) if unpainted > 0 else None
@@ -217,7 +203,7 @@ class Problem(Unknowns):
         total = sum(v @ k @ v for v, k in zip(AXES @ state["gain"].T, self._precisions, strict=True))
         total += (state["saturation"][0, 0] / self.prior.saturation) ** 2
         if self.photo is not None:
-            factor = self.photo.log_factor + state["camera"][0]
+            factor = self.photo.off_centre + state["camera"][0]
             total += factor @ self.photo.precision @ factor
         for i in self.shining(state):
             change = self._flux_change(state, start, i)
@@ -235,17 +221,23 @@ class Problem(Unknowns):
     # ---- normal equations ----------------------------------------------------------------------------------
 
     def normal(
-        self, point: Point, start: dict, sigma: float, descent: bool = True, bounded: bool = False
+        self,
+        point: Point,
+        start: dict,
+        sigma: float,
+        angle: float = NARROW_ANGLE,
+        descent: bool = True,
+        bounded: bool = False,
     ) -> Normal:
         """Linearise F at a point: gradient / 2 and Gauss-Newton Hessian / 2.
 
         The gradient by gain and saturation is exact, through T; their part of the Hessian, and what it has in
-        common with lights, is that of the block transport. Without ``descent`` only the Hessian is asked for,
-        and the gradient is 0. ``bounded``: no more of the sky should be white than was, also where a step
-        would lead there.
+        common with lights, is that of the block transport. ``angle`` is as of :meth:`.Derivatives.at`.
+        Without ``descent`` only the Hessian is asked for, and the gradient is 0. ``bounded``: no more of the
+        sky should be white than was, also where a step would lead there.
         """
         state, n = point.state, self.nodes
-        blocks, linear = self.blocks, self.derivatives.at(point)
+        blocks, linear = self.blocks, self.derivatives.at(point, angle)
         pictures, profile = linear.pictures, linear.profile
         unknowns = 3 * n + len(pictures)
         hessian, gradient = np.zeros((unknowns, unknowns)), np.zeros(unknowns)
@@ -256,19 +248,14 @@ class Problem(Unknowns):
         share, mean = self.likelihood.linear_mean(point.residual)
         slope = self._slope(point)
 
-        # ---- Gain: the Hessian by blocks, the gradient through T
+        # ---- Gain, by blocks
         squared = blocks.summed((slope * profile) ** 2 * robust)
         pulled = blocks.summed(slope * profile * robust * point.residual)
         mean_by_blocks = blocks.summed(slope * profile * share)
-        by_nodes, by_saturation = np.zeros((n, 3)), 0.0
-        if descent:
-            weighted = slope * (robust * point.residual + share * mean)
-            by_nodes, by_saturation = self._pulled_back(point, weighted)
         for c, j in enumerate(linear.jacobian):
             part = slice(c * n, (c + 1) * n)
             scaled = tensor(j * np.sqrt(squared[:, c : c + 1]))
             hessian[part, part] = dr.matmul(scaled, scaled, At=True).numpy()
-            gradient[part] = by_nodes[:, c]
             mean_by_unknowns[c, part] = mean_by_blocks[:, c] @ j
 
         # ---- Lights and saturation, by pixels; with the gain, by blocks
@@ -280,8 +267,6 @@ class Problem(Unknowns):
             gradient[rest] = flat @ (np.sqrt(robust) * point.residual).ravel()
             mean_by_unknowns[:, rest] = np.einsum("khwc,hwc->ck", pictures, slope * share)
             gradient[rest] += mean @ mean_by_unknowns[:, rest]
-            if self.saturates:
-                gradient[-1] = by_saturation
             for c, j in enumerate(linear.jacobian):
                 part = slice(c * n, (c + 1) * n)
                 weighted = pictures[..., c] * (slope**2 * profile * robust)[..., c]
@@ -289,6 +274,15 @@ class Problem(Unknowns):
                 hessian[rest, part] = in_blocks.T @ j
                 hessian[part, rest] = hessian[rest, part].T
                 lights_in_blocks.append(in_blocks)
+
+        # ---- The gradient by gain and saturation, through T
+        if descent:
+            weighted = slope * (robust * point.residual + share * mean)
+            light = point.transport.adjoint(np.float32(weighted)).numpy()[self.rows]
+            by_nodes, by_saturation = self._by_sky(point, light)
+            gradient[: 3 * n] = by_nodes.T.ravel()
+            if self.saturates:
+                gradient[-1] = by_saturation
 
         # ---- The mean of what was not painted, white sky, and the prior
         hessian += mean_by_unknowns.T @ mean_by_unknowns
@@ -304,7 +298,6 @@ class Problem(Unknowns):
             linear=linear,
             robust=robust,
             slope=slope,
-            residual=point.residual,
             squared=squared,
             pulled=pulled,
             lights=lights_in_blocks,
@@ -330,10 +323,6 @@ class Problem(Unknowns):
             by_unknowns = np.concatenate([by_nodes.T.ravel(), linear.by_lights(slope), others])
             hessian += np.outer(by_unknowns, by_unknowns)
             gradient += white * by_unknowns
-
-    def _pulled_back(self, point, picture):
-        """Return what :meth:`_by_sky` does of the sum of a picture times T E."""
-        return self._by_sky(point, point.transport.adjoint(np.float32(picture)).numpy()[self.rows])
 
     def _by_sky(self, point, light):
         """Return the derivatives of the sum of the active rows times ``light``, of the same shape.
@@ -382,7 +371,7 @@ class Problem(Unknowns):
             if name == "flux":
                 parts.append([self._flux_change(state, start, i)[axis]])
             elif name == "camera":
-                parts.append([self.photo.log_factor[axis] + state[name][i, axis]])
+                parts.append([self.photo.off_centre[axis] + state[name][i, axis]])
             elif name == "saturation":
                 parts.append(state[name][i])
             elif name == "turn":

@@ -23,7 +23,6 @@ class Normal:
     # ---- Of pixels
     robust: np.ndarray  # (h, w, 1), weights
     slope: np.ndarray  # (h, w, 3), of the display curve
-    residual: np.ndarray  # (h, w, 3)
     # ---- Sums over blocks of pixels
     # squared, pulled: (blocks, 3), of weight times slope squared, and of weight, slope and residual
     squared: np.ndarray

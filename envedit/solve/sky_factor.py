@@ -23,7 +23,7 @@ def find(
     envmap: np.ndarray,
     active: np.ndarray,
     picture: np.ndarray,
-    weight: np.ndarray | None = None,
+    weight: np.ndarray,
 ) -> np.ndarray:
     """Return the factor of each channel under which some texels of a map explain a picture best, (3,).
 
@@ -45,11 +45,10 @@ def find(
     factors = 2.0**STOPS
     factors = factors[factors <= most]
     wanted = turning.display_values(picture)
-    counted = 1.0 if weight is None else weight
 
     def misfit(factor):
         seen = turning.display_values(still + np.float32(factor) * lit)
-        return (np.square(seen - wanted) * counted).mean(axis=(0, 1))
+        return (np.square(seen - wanted) * weight).mean(axis=(0, 1))
 
     misfits = np.array([misfit(factor) for factor in factors])
     misfits = np.where(np.isfinite(misfits), misfits, np.inf)

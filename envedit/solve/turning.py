@@ -15,7 +15,7 @@ import numpy as np
 
 from envedit.core import latlong
 from envedit.losses import display_curve
-from envedit.solve.likelihood import INDEPENDENT, SIGMA
+from envedit.solve.likelihood import INDEPENDENT, SIGMA, sizes
 from envedit.transport.light_transport import LightTransport
 
 TURNS_RENDERED, TURNS_APART_TEXELS = 3, 4
@@ -54,7 +54,7 @@ def find(
     render: Callable[[np.ndarray, int], np.ndarray],
     envmap: np.ndarray,
     picture: np.ndarray,
-    weight: np.ndarray | None = None,
+    weight: np.ndarray,
     thorough: bool = True,
 ) -> Turn:
     """Find the turn of a map that explains a picture best.
@@ -127,9 +127,9 @@ def _fraction(render, maps, picture, weight):
     as in a product of differences with independent noise that noise is no bias.
     """
     (a1, b1), (a2, b2) = ([display_values(render(envmap, k)) for envmap in maps] for k in (0, 1))
-    target, count = display_values(picture), 1.0 if weight is None else weight
-    lengths = count * (b1 - a1) * (b2 - a2)
-    towards = count * ((target - a1) * (b2 - a2) + (target - a2) * (b1 - a1)) / 2
+    target = display_values(picture)
+    lengths = weight * (b1 - a1) * (b2 - a2)
+    towards = weight * ((target - a1) * (b2 - a2) + (target - a2) * (b1 - a1)) / 2
     if not lengths.sum() > 0:
         return 0.0, np.inf
     part = float(towards.sum() / lengths.sum())
@@ -137,14 +137,13 @@ def _fraction(render, maps, picture, weight):
     return part, float(np.sqrt(np.square(left).sum()) / lengths.sum())
 
 
-def apart(rendering: np.ndarray, picture: np.ndarray, weight: np.ndarray | None = None) -> float:
+def apart(rendering: np.ndarray, picture: np.ndarray, weight: np.ndarray) -> float:
     """Return a rendering's display residual, RMS over channels and mean over pixels; inf if it is not finite.
 
     ``rendering`` and ``picture`` (h, w, 3) are linear radiance; ``weight`` (h, w, 1): how much each pixel
     counts.
     """
-    size = np.sqrt(np.square(residuals(rendering, picture)).mean(axis=2, keepdims=True))
-    mean = size.mean() if weight is None else (size * weight).mean() / max(float(weight.mean()), 1e-30)
+    mean = (sizes(residuals(rendering, picture)) * weight).mean() / max(float(weight.mean()), 1e-30)
     return float(mean) if np.isfinite(mean) else np.inf
 
 
@@ -163,11 +162,10 @@ def _at_a_glance(transport, envmap, picture, weight, rendering):
 
     And that of the map as it is from its own rendering: the error of the block transport.
     """
-    count = np.ones((*picture.shape[:2], 1)) if weight is None else np.float64(weight)
     overview = transport.overview()
     height, width, _ = envmap.shape
     target, own = (overview.to_blocks(display_curve.values(one)) for one in (picture, rendering))
-    share = overview.to_blocks(count)
+    share = overview.to_blocks(np.float64(weight))
     lamps = overview.to_blocks(transport.other_light())
     omega = np.repeat(latlong.lookup_solid_angles(height, width), width).reshape(height, width)
     # By rows of texels first: a turn keeps them.

@@ -157,7 +157,7 @@ def _scene_digests(scene, base):
     """Return the digests of a scene and of all that it may read; its name where there is no such file."""
     from envedit.scene import scene as scenes  # with Mitsuba
 
-    files = filter(os.path.isfile, scenes.files(scene.file, scene.parameters, base))
+    files = filter(os.path.isfile, scenes.files(scene, base))
     return sorted({_digest(path) for path in files}) or scene.file
 
 

@@ -126,7 +126,7 @@ class Photo:
         moved = self.laid(rendering.shape, placed) if clear else self
         return replace(moved, recognised=clear or self.recognised)
 
-    @property
+    @functools.cached_property
     def precision(self) -> np.ndarray:
         """Inverse covariance of the camera's log factor, (3, 3)."""
         exposure = np.sqrt(3) * np.log(2) * EXPOSURE_DEVIATION
@@ -142,6 +142,11 @@ class Photo:
         """Log factor that it is drawn to, (3,): of a known exposure and white balance, otherwise none."""
         of_white = np.zeros(3) if self.kelvin is None else np.log(balance(self.kelvin))
         return np.log(2) * (self.stops or 0.0) + of_white
+
+    @property
+    def off_centre(self) -> np.ndarray:
+        """The camera's log factor less what it is drawn to, (3,)."""
+        return self.camera.log_factor - self.centre
 
     @property
     def picture(self) -> np.ndarray:

@@ -32,7 +32,7 @@ import numpy as np
 
 from envedit import config
 from envedit.core import latlong, seeds
-from envedit.core.array_cache import DiskCache, holds
+from envedit.core.array_cache import DiskCache, holds, under
 from envedit.core.arrays import tensor
 from envedit.core.errors import ConfigError, InputError, counted
 from envedit.core.radiance import require_radiance, require_unmasked
@@ -264,7 +264,7 @@ class LightTransport:
             holds(own, kept)
             and own["offset"].size in (1, 3 * pixels)
             and own["lost"] >= 0
-            and all(ColourMatrix.whole(_under(arrays, part), shape) for part, shape in shapes.items())
+            and all(ColourMatrix.whole(under(arrays, f"{part}/"), shape) for part, shape in shapes.items())
         )
 
     def _take(self, arrays):
@@ -274,7 +274,7 @@ class LightTransport:
         self.influence = np.array(arrays["influence"])
         self._offset = dr.opaque(mi.Float(arrays["offset"]))
         for part in ("forward", "reverse"):
-            setattr(self, part, ColourMatrix.from_arrays(_under(arrays, part)))
+            setattr(self, part, ColourMatrix.from_arrays(under(arrays, f"{part}/")))
 
     # ---- what it is ----------------------------------------------------------------------------------------
 
@@ -580,11 +580,6 @@ def _whole(value, least):
 def _within(numbers, least, most):
     """Return whether all of some numbers, of which there may be none, are in a range."""
     return bool(((least <= numbers) & (numbers <= most)).all())
-
-
-def _under(arrays, part):
-    """Return the arrays whose names begin with a part's, under the rest of their names."""
-    return {k.removeprefix(f"{part}/"): a for k, a in arrays.items() if k.startswith(f"{part}/")}
 
 
 def _as_tensor(values, shape, what):

@@ -19,7 +19,7 @@ from envedit.losses import display_curve
 from envedit.representations.layers.separation import separate
 from envedit.solve.likelihood import STATEMENTS, Likelihood
 from envedit.solve.prior import PHOTOGRAPHED
-from envedit.targets.pixel_weights import FOLLOWING
+from envedit.targets.pixel_weights import FOLLOWING, hidden_pixels, pixel_weight
 from experiments.painted_edits.painters import Paint, View
 
 ERROR = 1 / 3
@@ -59,7 +59,7 @@ def share(settings, view: View, initial: np.ndarray, paint: Paint) -> float:
     # ---- What is compared
     coverage = np.float32(paint.coverage[..., None])
     likelihood = Likelihood.of_paint(
-        weight=coverage + FOLLOWING * (1 - coverage),
+        weight=pixel_weight(coverage, hidden_pixels(view.scene), paint=1.0, hold=FOLLOWING),
         coverage=coverage,
         initial=initial,
         picture=paint.picture,

@@ -92,7 +92,7 @@ def plain(lit: scene.Scene, settings: config.Config, given: inputs.InputMap, fol
     file = Path(settings.scene.file)
     filled = {key: str(value) for key, value in settings.scene.parameters.items()}
     if given.source == inputs.SUNSKY:
-        text = scene.relit(file, "sky.exr", dict(settings.scene.parameters))
+        text = scene.relit(settings.scene, "sky.exr")
         mi.Bitmap(given.stored).write(str(folder / "sky.exr"))
         filled = {}
         file = folder / "lit.xml"

@@ -75,7 +75,9 @@ def spoiled(stage, calls, value, monkeypatch):
     arguments, _ = case(np.random.default_rng(1), weights=weights, iterations=40)
     representation, params, renderer, objective, original, *rest = arguments
     picture = objective._target.numpy()
-    objective = adam_loop.Objective(weights, picture, None, original[:3], 40, FakeDists())
+    objective = adam_loop.Objective(
+        weights, picture, np.ones_like(picture[..., :1]), original[:3], 40, FakeDists()
+    )
     assert objective.ramps.keys() == {*TERMS, "dists"}
     where, how = stage.removeprefix("slope of "), "slope" if stage.startswith("slope") else "value"
     if where == "map":
@@ -398,8 +400,10 @@ def test_dists_is_evaluated_now_and_then_and_counts_as_often(rng):
             dr.backward(total)
         return float(total[0]), float(terms["dists"][0]), dr.grad(crop).numpy()
 
-    often = adam_loop.Objective(weights, picture, None, original, 8, Counted())
-    rarely = adam_loop.Objective(weights, picture, None, original, 8, Counted(), every=4)
+    often = adam_loop.Objective(weights, picture, np.ones_like(picture[..., :1]), original, 8, Counted())
+    rarely = adam_loop.Objective(
+        weights, picture, np.ones_like(picture[..., :1]), original, 8, Counted(), every=4
+    )
     every = [seen(often, step) for step in range(8)]
     assert len(calls) == 8
     found = [seen(rarely, step) for step in range(8)]
@@ -410,7 +414,9 @@ def test_dists_is_evaluated_now_and_then_and_counts_as_often(rng):
         assert total == pytest.approx(last[0], rel=1e-6) and term == pytest.approx(last[1], rel=1e-6)
         np.testing.assert_allclose(gradient, 4 * last[2] if step % 4 == 0 else 0 * gradient, rtol=1e-5)
 
-    resumed = adam_loop.Objective(weights, picture, None, original, 8, Counted(), every=4)
+    resumed = adam_loop.Objective(
+        weights, picture, np.ones_like(picture[..., :1]), original, 8, Counted(), every=4
+    )
     resumed.resume([{"dists": found[4][1]}])
     assert seen(resumed, 5)[:2] == found[5][:2] and len(calls) == 10
 
@@ -423,7 +429,9 @@ def test_a_bad_value_of_dists_spoils_one_step_alone(rng):
             return lambda shown: dr.mean(shown.array) * 0 + next(values)
 
     picture, original = rng.random((4, 4, 3)), np.float32(rng.random((3, 6, 3)))
-    objective = adam_loop.Objective(config.Loss(dists=1.0), picture, None, original, 6, Fake(), every=2)
+    objective = adam_loop.Objective(
+        config.Loss(dists=1.0), picture, np.ones_like(picture[..., :1]), original, 6, Fake(), every=2
+    )
     shown, crop = mi.TensorXf(np.float32(picture)), mi.TensorXf(original)
     terms = [float(objective(shown, crop, step)[1]["dists"][0]) for step in range(6)]
     assert terms[:2] == [1, 1] and math.isnan(terms[2]) and terms[3:] == [1, 2, 2]

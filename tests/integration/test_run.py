@@ -336,10 +336,10 @@ def test_a_configuration_in_its_own_folder_is_kept_by_a_first_run_that_resumes(t
 
 @pytest.mark.slow
 def test_ctrl_c_inside_an_operation_is_ctrl_c(tmp_path, rng, capsys, monkeypatch):
-    def press(self, crop, original, start):
+    def press(self, x, slopes):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(adam_loop._PlaceRows, "eval", press)
+    monkeypatch.setattr(adam_loop._Slope, "eval", press)
     assert call(world(tmp_path, rng, **PIXELS), "--quiet", *changed(optimizer__kind="adam")) == 130
     assert "interrupted" in capsys.readouterr().err
 

@@ -304,7 +304,7 @@ class Found:
     def __init__(self, transport, image, wanted, weight=None):
         layers = Layers.of(image[:ROWS], (0, HEIGHT), cycles=6)
         encoded = layers.start()
-        likelihood = Likelihood(on_average_one(weight, wanted.shape[:2]))
+        likelihood = None if weight is None else Likelihood(on_average_one(weight))
         problem = Problem(layers, transport, image, wanted, likelihood, saturates=True)
         likeliest = search.search(problem, problem.state(encoded))
         solution = gauss_newton.solve(problem, encoded, run=likeliest.run)

@@ -27,7 +27,9 @@ def follow(picture):
     """Edit the logarithms of the map towards a picture: the loss falls, and all stays finite."""
     made, before = representations.LogPixels(), sky()
     renderer = StoredRenderer(LightTransport.build(matte(), 16, 32, spp=16, max_depth=3))
-    objective = adam_loop.Objective(config.Loss(image_l2=1.0), picture, None, before, STEPS)
+    objective = adam_loop.Objective(
+        config.Loss(image_l2=1.0), picture, np.ones_like(picture[..., :1]), before, STEPS
+    )
     settings = config.Optimizer(iterations=STEPS, lr=0.02)
     start = made.encode(before)
     params, state = adam_loop.optimise(made, start, renderer, objective, before, 0, settings)

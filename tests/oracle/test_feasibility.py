@@ -57,7 +57,7 @@ def render(transport, image):
 
 
 def weighed(weight):
-    return Likelihood(on_average_one(weight, PIXELS))
+    return Likelihood(on_average_one(weight))
 
 
 def descend(a, b, sweeps=500):
@@ -127,6 +127,14 @@ def test_a_map_that_is_known_is_within_reach_whatever_the_solution_finds(dense, 
     found = feasibility.reachable(dense, envmap, target, known=other)
     assert found.share > 0.999 and np.array_equal(found.envmap, other)
     assert feasibility.reachable(dense, envmap, target, known=envmap).share == 0
+
+
+def test_what_is_called_after_every_step_may_end_the_search(dense, envmap):
+    def stop():
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        feasibility.reachable(dense, envmap, 2 * render(dense, envmap), after_step=stop)
 
 
 def test_share_is_of_display_values_in_the_painted_region(dense, envmap, rng):

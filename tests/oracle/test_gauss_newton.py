@@ -23,6 +23,7 @@ from envedit.solve.likelihood import Likelihood, on_average_one
 from envedit.solve.map_problem import Problem
 from envedit.solve.prior import Prior, of_paint
 from envedit.solve.white_sky import WhiteSky
+from envedit.targets.photo import Camera, Photo
 from envedit.targets.pixel_weights import pixel_weight
 from tests.oracles.dense_transport import DenseTransport, node_shares
 from tests.oracles.maps import angle
@@ -87,7 +88,7 @@ def moved(problem, state, unknowns, k, h):
 @pytest.fixture(scope="module")
 def case():
     """A sky with a lamp, and a state where every unknown has moved."""
-    return moved_case(lambda weight: Likelihood(on_average_one(weight, FILM)))
+    return moved_case(lambda weight: Likelihood(on_average_one(weight)))
 
 
 @pytest.fixture(scope="module")
@@ -108,9 +109,9 @@ def photographed():
     factor = np.array([0.4, 0.1, -0.3])
     clipped = np.zeros((*FILM, 3), bool)
     clipped[::2, ::2] = True
-    photo = map_problem.Photographed(factor, np.diag([3.0, 4.0, 5.0]))
+    photo = Photo(np.zeros((*FILM, 8)), Camera("linear", factor), ("linear",))
     problem, params, start, state = moved_case(
-        lambda weight: Likelihood(on_average_one(weight, FILM)), photo=photo, clipped=clipped
+        lambda weight: Likelihood(on_average_one(weight)), photo=photo, clipped=clipped
     )
     return problem, params, start, state | {"camera": np.array([[0.3, -0.2, 0.1]])}
 

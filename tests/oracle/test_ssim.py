@@ -63,19 +63,15 @@ def test_ssim_can_be_reused(rng):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("weighted", [False, True])
-def test_ssim_of_pictures_below_each_other_is_that_of_each(weighted, rng):
-    """Value and gradient; each counts by its pixels, or by its weight."""
+def test_ssim_of_pictures_below_each_other_is_that_of_each(rng):
+    """Value and gradient; each counts by its weight."""
     x, y, w = rng.random((30, 14, 3)), rng.random((30, 14, 3)), rng.random((30, 14, 1)) + 0.1
     rows = slice(0, 12), slice(12, 30)
     w[rows[1]] *= 3
-    shares = [w[some].sum() / w.sum() if weighted else len(x[some]) / 30 for some in rows]
-    stacked = StackedSsim(double(y), double(w) if weighted else None, rows)
+    shares = [w[some].sum() / w.sum() for some in rows]
+    stacked = StackedSsim(double(y), double(w), rows)
     value, found = gradient(stacked, double(x))
-    each = [
-        gradient(Ssim(double(y[some]), double(w[some]) if weighted else None), double(x[some]))
-        for some in rows
-    ]
+    each = [gradient(Ssim(double(y[some]), double(w[some])), double(x[some])) for some in rows]
     assert value == pytest.approx(sum(s * v for s, (v, _) in zip(shares, each, strict=True)), rel=1e-12)
     expected = np.concatenate([s * g for s, (_, g) in zip(shares, each, strict=True)])
     np.testing.assert_allclose(found, expected, rtol=1e-12)

@@ -191,7 +191,7 @@ def test_a_scene_without_an_environment_is_lit_by_a_map_beside_its_lamps(tmp_pat
     assert inputs.share(lit, radiance, 1) == pytest.approx(1 - alone.mean() / both.mean(), abs=0.03)
     assert any("the map lights the scene beside any lamps of its own" in note for note in lit.notes)
     again = tmp_path / "again.xml"
-    again.write_text(scene.relit(tmp_path / "test.xml", "own.exr"))
+    again.write_text(scene.relit(config.Scene(str(tmp_path / "test.xml")), "own.exr"))
     close(plain(again)[..., :3], both)
 
 
@@ -239,7 +239,7 @@ def test_the_scale_of_the_scene_can_be_dropped(tmp_path, rng):
     np.testing.assert_allclose(other, 800 * radiance, rtol=1e-6)
     assert lit.own.scale == 1 and any("scale 1 (scene.scale) takes the place of" in note for note in notes)
     again = tmp_path / "again.xml"
-    again.write_text(scene.relit(tmp_path / "test.xml", "own.exr", scale=1))
+    again.write_text(scene.relit(config.Scene(str(tmp_path / "test.xml"), scale=1), "own.exr"))
     close(lit.render(radiance, SPP, 3), plain(again)[..., :3])
 
 

@@ -30,7 +30,10 @@ def rendered(transport, image):
 
 def found_of(transport, image, picture, **more):
     """Find a turn where T is exact, so that it renders turned maps too."""
-    return turning.find(transport, lambda envmap, _: rendered(transport, envmap), image, picture, **more)
+    even = np.ones_like(picture[..., :1])
+    return turning.find(
+        transport, lambda envmap, _: rendered(transport, envmap), image, picture, even, **more
+    )
 
 
 @pytest.mark.parametrize("texels", [0.0, 0.5, 7.0, 21.3, 32.0, 63.9])
@@ -120,5 +123,5 @@ def test_a_whole_turn_is_preferred_within_the_noise(texels, noise, whole, traced
         return np.float32(picture * np.exp(noise * rng.standard_normal((*FILM, 1))))
 
     picture = render(latlong.rotate(image, degrees), 2)
-    found = turning.find(traced, render, image, picture)
+    found = turning.find(traced, render, image, picture, np.ones_like(picture[..., :1]))
     assert found.degrees % (360 / GRID[1]) == 0 if whole else abs(found.degrees - degrees) < 0.5

@@ -552,7 +552,7 @@ def test_a_scene_is_made_anew_when_a_layer_changes(tmp_path):
     add_dome(stage)
     first = scene.load(saved(stage), 8)
     assert scene.load(saved(stage), 8).digest == first.digest
-    assert str(tmp_path / "below.usda") in map(str, scene.files(first.path, {}))
+    assert str(tmp_path / "below.usda") in map(str, scene.files(config.Scene(str(first.path))))
     UsdGeom.Mesh.Get(below, "/square").GetDisplayColorAttr().Set([Gf.Vec3f(0.5, 0.5, 0.5)])
     saved(below)
     assert scene.load(saved(stage), 8).digest != first.digest

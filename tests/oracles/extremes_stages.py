@@ -152,7 +152,7 @@ def edited(m, folder):
         lights = search.search(problem, problem.state(params))
         assert np.isfinite(made.decode(problem.solution_params(lights.run.state)).numpy()).all()
     weights = config.Loss(ssim=0.1, image_l1=1.0, image_l2=1.0)
-    objective = adam_loop.Objective(weights, wanted, None, m, STEPS)
+    objective = adam_loop.Objective(weights, wanted, np.ones_like(wanted[..., :1]), m, STEPS)
     settings = config.Optimizer(iterations=STEPS, lr=0.003)
     start = made.decode(params).numpy()
     params, state = adam_loop.optimise(made, params, traced, objective, m, 0, settings)

@@ -45,6 +45,8 @@ def case(rng, rows=3, iterations=12, weights=None, lr=0.02, schedule="constant",
     renderer = Matrix(rng, **kwargs)
     weights = weights or config.Loss(ssim=1.0, image_l1=1.0)
     picture = matrix_of(renderer, true)
+    if pixel_weight is None:
+        pixel_weight = np.ones_like(picture[..., :1])
     objective = adam_loop.Objective(weights, picture, pixel_weight, original[:rows], iterations)
     representation = representations.LogPixels()
     params = representation.encode(original[:rows])

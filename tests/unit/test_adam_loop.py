@@ -43,7 +43,7 @@ def test_objective_is_the_weighted_sum_of_its_losses(rng):
     picture, rendering = (rng.random((12, 14, 3)).astype(np.float32) for _ in range(2))
     original, crop = sky(rng)[:3], sky(rng)[:3]
     weights = config.Loss(ssim=2.0, luminance=0.01, l1=0.003, tv=0.5, image_l1=0.7, image_l2=3.0)
-    objective = adam_loop.Objective(weights, picture, None, original, 10)
+    objective = adam_loop.Objective(weights, picture, np.ones_like(picture[..., :1]), original, 10)
     total, terms = objective(single(rendering), single(crop), 4)
     target, shown = (double(plain_display(np.float64(x))) for x in (picture, rendering))
     expected = {
@@ -65,17 +65,18 @@ def test_weights_walk_from_start_to_end_of_the_run(step, ssim, luminance, rng):
     """Sec. 6.2: regularisers down, SSIM up; geometric, so that the middle is the geometric mean."""
     picture, rendering = (mi.TensorXf(rng.random((12, 14, 3)).astype(np.float32)) for _ in range(2))
     original, crop = sky(rng)[:3], mi.TensorXf(sky(rng)[:3])
+    even = np.ones((12, 14, 1), np.float32)
     ramped = config.Loss(ssim=(1.0, 1e4), luminance=(1e-4, 1e-8))
-    _, terms = adam_loop.Objective(ramped, picture.numpy(), None, original, 11)(rendering, crop, step)
+    _, terms = adam_loop.Objective(ramped, picture.numpy(), even, original, 11)(rendering, crop, step)
     plain = config.Loss(ssim=1.0, luminance=1.0)
-    _, raw = adam_loop.Objective(plain, picture.numpy(), None, original, 11)(rendering, crop, step)
+    _, raw = adam_loop.Objective(plain, picture.numpy(), even, original, 11)(rendering, crop, step)
     np.testing.assert_allclose(terms["ssim"][0] / raw["ssim"][0], ssim, rtol=1e-5)
     np.testing.assert_allclose(terms["luminance"][0] / raw["luminance"][0], luminance, rtol=1e-5)
 
 
 def test_terms_without_weight_and_dists_are_left_out(rng):
     weights = config.Loss(ssim=1.0, luminance=0.0, l1=0.0, dists=0.6, tv=0.0, image_l1=0.0, image_l2=0.0)
-    objective = adam_loop.Objective(weights, rng.random((12, 14, 3)), None, sky(rng)[:3], 5)
+    objective = adam_loop.Objective(weights, rng.random((12, 14, 3)), np.ones((12, 14, 1)), sky(rng)[:3], 5)
     _, terms = objective(single(rng.random((12, 14, 3))), single(sky(rng)[:3]), 0)
     assert terms.keys() == {"ssim"}
 

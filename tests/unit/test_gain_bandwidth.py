@@ -43,6 +43,7 @@ def sampled(exact, seed, samples=64):
 
 def told(first, second=None, weight=None, value=0.5):
     picture = np.full((FILM, FILM, 3), value)
+    weight = np.ones((FILM, FILM, 1)) if weight is None else weight
     return gain_bandwidth.octaves(first, second or first, BACKGROUND, ROWS, picture, weight, 4)
 
 

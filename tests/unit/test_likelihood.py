@@ -45,7 +45,7 @@ def formula(one, residual, sigma):
 @pytest.mark.parametrize("sigma", [0.02, 0.2])
 @pytest.mark.parametrize(("painted", "mean"), [(False, 0.01), (True, 0.01), (True, 0.1)])
 def test_misfit_is_that_of_the_formula(sigma, painted, mean, rng):
-    one = of_stroke()[0] if painted else Likelihood(likelihood.on_average_one(rng.random((*FILM, 1)), FILM))
+    one = of_stroke()[0] if painted else Likelihood(likelihood.on_average_one(rng.random((*FILM, 1))))
     residual = rng.normal(mean, 0.1, (*FILM, 3))
     assert one.misfit(residual, sigma) == pytest.approx(formula(one, residual, sigma), rel=1e-5)
     assert one.misfit(0 * residual, sigma) == 0
@@ -84,7 +84,10 @@ def test_noise_of_squares_is_the_most_likely(rng):
 def test_display_values_are_known_to_the_noise_of_the_target(noise, least):
     picture = np.full((*FILM, 3), 0.5, np.float32)
     of_pixels = None if noise is None else np.full(FILM, noise)
-    assert Likelihood.of_target(Target(picture, None, None, "", noise=of_pixels)).least_noise == least
+    assert (
+        Likelihood.of_target(Target(picture, np.ones((*FILM, 1)), None, "", noise=of_pixels)).least_noise
+        == least
+    )
 
 
 def test_noise_of_paint_is_at_most_a_share_of_the_change_that_is_seen():
@@ -118,7 +121,7 @@ def test_white_is_what_most_of_the_picture_was_below_and_at_least_one(before, wh
 
 @pytest.mark.parametrize("film", [(6, 8), FILM, (64, 64)])
 def test_noise_with_hubers_loss_makes_the_misfit_that_of_independent_values(film, rng):
-    one = Likelihood(likelihood.on_average_one(None, film), least_noise=1e-4)
+    one = Likelihood(np.ones((*film, 1), np.float32), least_noise=1e-4)
     residual = rng.normal(0, 0.03, (*film, 3)) * np.where(rng.random((*film, 1)) < 0.1, 20, 1)
     found = one.noise(residual)
     assert one.misfit(residual, found) == pytest.approx(3 * INDEPENDENT, rel=1e-6)
@@ -134,7 +137,7 @@ def test_all_paint_is_a_few_statements_whatever_its_size(rows):
     painted = 1 / 1.3 if rows < 20 else 1
     assert one.independent == pytest.approx(STATEMENTS / painted, rel=1e-5)
     assert (one.rest is None) == (rows == 20)
-    assert likelihood.on_average_one(one.weight, (20, 240)).mean() == pytest.approx(1, rel=1e-5)
+    assert likelihood.on_average_one(one.weight).mean() == pytest.approx(1, rel=1e-5)
     pattern = 0.1 * (1 - coverage) * (-1.0) ** np.arange(240)[:, None]
     found = one.misfit(np.broadcast_to(pattern, residual.shape), 0.1)
     assert found == pytest.approx(0.3 * 3 * STATEMENTS * (rows < 20), rel=1e-5)

@@ -11,6 +11,7 @@ from envedit.solve import sky_factor
 
 HEIGHT, WIDTH, PIXELS = 4, 8, 6
 ALL = np.ones((HEIGHT, WIDTH), bool)
+EVEN = np.ones((PIXELS, PIXELS, 1), np.float32)
 
 
 class Linear:
@@ -48,7 +49,7 @@ def envmap(rng):
 def test_each_channel_has_its_own_factor(transport, envmap):
     """To half a step, 4 %."""
     wanted = np.array([3.0, 0.4, 1.0])
-    found = sky_factor.find(transport, envmap, ALL, transport.exact(envmap * wanted))
+    found = sky_factor.find(transport, envmap, ALL, transport.exact(envmap * wanted), EVEN)
     np.testing.assert_allclose(found, wanted, rtol=0.045)
 
 
@@ -56,14 +57,14 @@ def test_each_channel_has_its_own_factor(transport, envmap):
 def test_noise_alone_changes_nothing(noise, transport, envmap, rng):
     picture = transport.exact(envmap)
     picture = np.maximum(picture + noise * rng.normal(size=picture.shape), 0).astype(np.float32)
-    np.testing.assert_array_equal(sky_factor.find(transport, envmap, ALL, picture), 1)
+    np.testing.assert_array_equal(sky_factor.find(transport, envmap, ALL, picture, EVEN), 1)
 
 
 def test_texels_that_stay_and_pixels_that_do_not_count_have_no_say(transport, envmap):
     active = ALL.copy()
     active[:, : WIDTH // 2] = False
     picture = transport.exact(np.where(active[..., None], 4 * envmap, envmap))
-    np.testing.assert_allclose(sky_factor.find(transport, envmap, active, picture), 4, rtol=0.045)
+    np.testing.assert_allclose(sky_factor.find(transport, envmap, active, picture, EVEN), 4, rtol=0.045)
     picture = transport.exact(2 * envmap)
     picture[: PIXELS // 2] = 0.9
     weight = np.ones((PIXELS, PIXELS, 1), np.float32)
@@ -77,7 +78,7 @@ def test_at_the_extremes_of_radiance_factors_are_finite(level, transport):
     envmap = np.full((HEIGHT, WIDTH, 3), level, np.float32)
     for value in (0, 0.5, 1e6):
         picture = np.full((PIXELS, PIXELS, 3), value, np.float32)
-        found = sky_factor.find(transport, envmap, ALL, picture)
+        found = sky_factor.find(transport, envmap, ALL, picture, EVEN)
         assert np.isfinite(found).all() and (found > 0).all()
         assert (level * found <= BRIGHTEST * (1 + 1e-6)).all()
         if level == 0:
@@ -86,5 +87,5 @@ def test_at_the_extremes_of_radiance_factors_are_finite(level, transport):
 
 def test_a_black_picture_makes_the_sky_dark(transport, envmap):
     picture = np.zeros((PIXELS, PIXELS, 3), np.float32)
-    found = sky_factor.find(transport, envmap, ALL, picture)
+    found = sky_factor.find(transport, envmap, ALL, picture, EVEN)
     np.testing.assert_array_equal(found, 2.0 ** sky_factor.STOPS[0])

@@ -133,7 +133,6 @@ class Session:
         self.transport = traced.resolved(self.map, limit=COLUMNS)
         self._quick = self._of_fewer_samples()
         self._recorded = self._quick is self.transport
-        self._watched: Any = _Watched(self.transport, self.newer)  # a transport in all it does
 
         # ---- Lights, and the rendering as it is
         self._stage("separating lights")
@@ -375,7 +374,7 @@ class Session:
         self.status = {"iterations": 0, **{name: self.status[name] for name in ("steps", "number", "client")}}
         self._tell_solution()
 
-    def _unless_newer(self, *_):
+    def _unless_newer(self):
         self._give_back_memory()
         if self.newer():
             raise SupersededError
@@ -412,7 +411,7 @@ class Session:
         self._tell_doing("estimating how much of the target is feasible")
         solution = self.solution
         self.reach = feasibility.reachable(
-            self._watched,
+            self.transport,
             solution.origin,
             solution.target,
             solution.problem.likelihood,
@@ -421,6 +420,7 @@ class Session:
             rendered=solution.base,
             known=solution.point.edited,
             kept=solution.kept,
+            after_step=self._unless_newer,
         )
         self._tell_unreachable()
         self.tell_state()
@@ -670,18 +670,3 @@ class Session:
             f"the picture differs from the one shown before by {change.mean():.2g} of a display value on "
             f"average, {change.max():.2g} at most"
         )
-
-
-class _Watched:
-    """A transport whose every call first asks whether a newer edit waits; those that it returns do so too."""
-
-    def __init__(self, transport, newer):
-        self._transport, self._newer = transport, newer
-
-    def __getattr__(self, name):
-        found = getattr(self._transport, name)
-        if callable(found) and self._newer():
-            raise SupersededError
-        if name != "resolved":
-            return found
-        return lambda *args, **options: _Watched(found(*args, **options), self._newer)

@@ -206,7 +206,7 @@ class Renderer(Table):
     pixels: int | str = key(
         "auto",
         OrAuto(Integer(64, 1 << 30)),
-        'most pixels that the edit is solved on; "auto": 16384 for layers by Gauss-Newton, 4096 of paint, else all',
+        'most pixels that the edit is solved on; "auto": 16384 (paint: 4096) by Gauss-Newton, else all',
         "pixels",
         EDITED,
     )

@@ -4,8 +4,9 @@ Everything here runs on the thread that owns Dr.Jit. What an edit asks for at on
 :meth:`Session.update`; what takes longer, in pieces by :meth:`Session.advance`, until it returns False or a
 new edit comes.
 
-The solution (``solution.py``) is towards paint on T E_0, of a large picture at the size at which edits are
-solved. The edit that is saved is the pipeline's, which takes the solution here, and judges its result.
+The solution (``solution.py``) is towards paint on T E_0, of a large picture on the film on which paint is
+solved; pages are shown that of other edits. The edit that is saved is the pipeline's, which takes the
+solution here, and judges its result.
 """
 
 from __future__ import annotations
@@ -106,7 +107,7 @@ class Session:
         self.newer = lambda: not self._saving and newer()
         self._memory_due = 0.0  # when freed buffers are given back while work goes on
         self._rendered: tuple[int, Any] | None = None  # passes and their sum
-        self._shown: np.ndarray | None = None  # the rendering by T that the pages show
+        self._shown: np.ndarray | None = None  # the solution's rendering that the pages show
         self._sharp: Scene | None = None
         self._wide: inputs.InputMap | None = None  # the map as it is shown large
 
@@ -115,7 +116,7 @@ class Session:
         if project.photo:
             self._match(project.photo)
         self._stage("loading the scene")
-        self.scene = self._worked_on(inputs.load_scene(settings.scene, project.base))
+        self.scene, solved_on = self._films(inputs.load_scene(settings.scene, project.base))
         self._stage("reading the map")
         self.given = inputs.read_map(settings.input, self.scene, settings.input.width)
         self.notes = self.given.warnings
@@ -126,11 +127,11 @@ class Session:
         self.map = self.given.radiance
         self.rows = inputs.active_rows(settings.input.rows, len(self.map))
 
-        # ---- Light transport, and one of fewer samples while a pointer moves
+        # ---- Light transport, that of fewer pixels to solve with, and of fewer samples while a pointer moves
         renderers.check(settings, self.scene, self.map.shape[:2])
         self._stage("tracing light transport")
-        traced = renderers.trace(settings, self.scene, self.map.shape[:2], self._progress)
-        self.transport = traced.resolved(self.map, limit=COLUMNS)
+        self.transport = self._traced(settings, self.scene)
+        small = self.transport if solved_on is self.scene else self._traced(settings, solved_on)
         self._quick = self._of_fewer_samples()
         self._recorded = self._quick is self.transport
 
@@ -141,7 +142,7 @@ class Session:
         self.before = self.transport.apply(tensor(self.map)).numpy()
 
         # ---- What solves for an edit
-        self.solution = Solution(settings, self.scene, self.placed, self.transport, self.rows)
+        self.solution = Solution(settings, solved_on, self.placed, small, self.rows)
         self._aim(self._usable(project.document))
         if project.start and self.solving:
             self._go_on_from(project.start)
@@ -151,8 +152,12 @@ class Session:
         settings = self.project.settings
         if self.transport.spp <= QUICK_SPP:
             return self.transport
-        fewer = replace(settings, renderer=replace(settings.renderer, spp=QUICK_SPP))
-        return renderers.trace(fewer, self.scene, self.map.shape[:2], self._progress)
+        return self._traced(replace(settings, renderer=replace(settings.renderer, spp=QUICK_SPP)), self.scene)
+
+    def _traced(self, settings, scene):
+        """Return the transport of a scene, with columns of the map as it is."""
+        traced = renderers.trace(settings, scene, self.map.shape[:2], self._progress)
+        return traced.resolved(self.map, limit=COLUMNS)
 
     def _usable(self, document):
         """Return a document without the strokes on views that the scene has not, each with a note."""
@@ -247,12 +252,14 @@ class Session:
         bright = self._quick.bright_texels(found)[:DRAGGED_COLUMNS]
         self._dragging = self._quick.with_probed(bright)
         changed = self._dragging.apply(tensor(found)).numpy() - self._still_quick
-        self._preview = found, np.maximum(self.solution.point.rendering + changed, 0)
+        self._preview = found, np.maximum(self._still + changed, 0)
 
     def _render_quickly(self):
-        """Render the solution through few samples, for what a dragged light changes."""
-        self._quick = self._quick.resolved(self.solution.point.edited, limit=COLUMNS)
-        self._still_quick = self._quick.apply(tensor(self.solution.point.edited)).numpy()
+        """Render the solution, and through few samples, for what a dragged light changes."""
+        edited = self.solution.point.edited
+        self._still = self._by_transport(edited)
+        self._quick = self._quick.resolved(edited, limit=COLUMNS)
+        self._still_quick = self._quick.apply(tensor(edited)).numpy()
 
     def _go_on_from(self, file):
         """Take the solution that was saved of this document."""
@@ -401,17 +408,21 @@ class Session:
             self._sharp = working_size.scaled(self.scene, SHARPER) or self.scene
         return self._sharp.render(shown, PASS, Seeds(self.project.settings.seed).pass_of_page(i))
 
-    def _worked_on(self, scene):
-        """Return the scene at the size that an edit is solved at; as it is, if strokes are in its pixels."""
-        in_pixels = any(one.get("units") == "pixels" for one in self.project.document.strokes)
-        return scene if in_pixels else working_size.smaller(self.project.settings, scene)
+    def _films(self, scene):
+        """Return the scene on the films that are shown and solved on; as it is if strokes are in pixels."""
+        if any(one.get("units") == "pixels" for one in self.project.document.strokes):
+            return scene, scene
+        settings = self.project.settings
+        shown = working_size.smaller(settings, scene)
+        small = working_size.smaller(settings, scene, painted=True)
+        return shown, shown if small.width == shown.width else small
 
     def _reach(self):
         """Ask how much of what is painted any light could do; a newer edit ends it."""
         self._tell_doing("estimating how much of the target is feasible")
         solution = self.solution
         self.reach = feasibility.reachable(
-            self.transport,
+            solution.transport,
             solution.origin,
             solution.target,
             solution.problem.likelihood,
@@ -429,8 +440,8 @@ class Session:
         """Say what reaches more, where little is reached; a newer edit ends it."""
         solution, document, self.advised = self.solution, self.document, True
         request = solution.request
-        white = self.transport.linear(tensor(np.ones_like(self.map))).numpy()
-        lamps = self.transport.apply(tensor(np.zeros_like(self.map))).numpy()
+        white = solution.transport.linear(tensor(np.ones_like(self.map))).numpy()
+        lamps = solution.transport.apply(tensor(np.zeros_like(self.map))).numpy()
         rendering, alone = solution.point.rendering, solution.coverages()
         text, actions = advice.said(document, request, rendering, self.reach, alone, white, lamps)
         if text:
@@ -448,7 +459,8 @@ class Session:
     def _tell_unreachable(self):
         """Show what of the paint is not feasible, once that is known."""
         if self.reach is not None:
-            self.tell.frame("unreachable", "transport", preview.unreachable(self.reach), self.scene.rows)
+            unreachable = preview.unreachable(self.reach)
+            self.tell.frame("unreachable", "transport", unreachable, self.solution.scene.rows)
 
     # ---- what is shown -------------------------------------------------------------------------------------
 
@@ -465,19 +477,26 @@ class Session:
     def _show(self):
         edited = self._edited()
         shown = self._adjusted(edited)
-        rendering = self._preview[1] if self._dragged else self.solution.point.rendering
-        if shown is not edited:
-            by = self._dragging if self._dragged else self.solution.point.transport
-            rendering = by.apply(tensor(shown)).numpy()
-        if rendering is not self._shown:  # a stroke that is being drawn has changed nothing yet
-            self._shown = rendering
-            self.tell.frame("render", "transport", rendering, self.scene.rows)
+        of = self._preview[1] if self._dragged else self.solution.point.rendering
+        if of is not self._shown or shown is not edited:  # a stroke being drawn has changed nothing yet
+            self._shown = of if shown is edited else None
+            self.tell.frame("render", "transport", self._rendering(edited, shown), self.scene.rows)
             self.tell.frame("map", "transport", shown)
         if not self._dragged:
             solution = self.solution
             both, white = (solution.target, solution.point.rendering), solution.problem.likelihood.white
             target, reached = (display_curve.values(one, white) for one in both)
-            self.tell.frame("difference", "transport", target - reached, self.scene.rows)
+            self.tell.frame("difference", "transport", target - reached, solution.scene.rows)
+
+    def _rendering(self, edited, shown):
+        """Return the rendering that is shown of the edited map, adjusted or not."""
+        if not self._dragged:
+            return self._by_transport(shown)
+        return self._preview[1] if shown is edited else self._dragging.apply(tensor(shown)).numpy()
+
+    def _by_transport(self, envmap):
+        """Render a map at the size that is shown."""
+        return self.transport.resolved(envmap, limit=COLUMNS).apply(tensor(envmap)).numpy()
 
     def sky(self) -> None:
         """Show the map large, as it is edited and as it was given, at the resolution of its file."""

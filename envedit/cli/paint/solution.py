@@ -62,7 +62,7 @@ class Request:
 class Solution:
     """What is painted on, what is painted, and the solution.
 
-    ``settings`` are of the project, ``scene`` is at the size at which edits are solved, ``placed`` are the
+    ``settings`` are of the project, ``scene`` is at the size at which paint is solved, ``placed`` are the
     map's lights, placed by hand, ``transport`` is T, ``rows`` may change.
 
     ``origin`` (H, W, 3) is the map that is painted on, ``base`` (h, w, 3) its rendering T E_0, and ``kept``

@@ -69,7 +69,7 @@ def recordings(
     # A path tracer's samples a pixel are not meant for T.
     transport = traced or trace(settings.seed, spp="auto")
     fits = shape[1] >= 4 * CYCLES  # an octave of detail into the map
-    if not fits or target.coverage is not None or settings.representation.cycles != "auto":
+    if not fits or target.painted or settings.representation.cycles != "auto":
         return Recordings(transport)
     pixels, few = scene.width * scene.height, min(SECOND_SPP, transport.spp)
     second = trace(

@@ -103,8 +103,7 @@ class Preparation:
         with self.clock("fit_s"):
             representation, _ = self._encoded(self.original[self.rows.slice])
         with self.clock("transport_s"):
-            recordings = self._recorded(representation, target)
-        return bool(recordings and recordings.octaves)
+            return bool(self._recorded(representation, target).octaves)
 
     def edit(self, target: Target) -> PreparedEdit:
         """Prepare the edit; the sky is turned where that explains the target better.

@@ -88,7 +88,7 @@ class _Move:
 def search(
     problem: Problem,
     start: dict,
-    after_step: Callable[[], None] | None = None,
+    after_step: Callable[[], None] = lambda: None,
     most: int = EXPLANATION_STEPS,
     left: Explanation | None = None,
 ) -> Explanation:
@@ -115,7 +115,7 @@ def search(
 
 
 def further(
-    problem: Problem, run: gauss_newton.Run, after_step: Callable[[], None] | None = None
+    problem: Problem, run: gauss_newton.Run, after_step: Callable[[], None] = lambda: None
 ) -> Explanation | None:
     """Find an explanation that is likelier than a solution, whose sky it begins with; None if there is none.
 
@@ -167,8 +167,7 @@ def _neighbours(problem, best, moves, after_step, steps, sky):
         done = move.after(best.done, problem.layers.lights.own)
         neighbours.append(_descended(problem, done, run, best.point.transport, steps, likeliest))
         likeliest = min(likeliest, neighbours[-1].score)
-        if after_step:
-            after_step()
+        after_step()
     return neighbours
 
 

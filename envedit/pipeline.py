@@ -83,7 +83,7 @@ def run(
         else:
             edit.leave()
         edit.adjust()
-        if edit.transport and edit.target.coverage is not None:
+        if edit.transport and edit.target.painted:
             edit.check_feasibility()
         edit.render()
         edit.render_variants()
@@ -238,7 +238,7 @@ class _Edit:
             self.notes.append(f"solved on a picture of {self.small.width}x{self.small.height} pixels")
         self.notes.append(self.target.source)
         transport = preparation.renderer.transport
-        if transport and target.coverage is not None:
+        if transport and target.painted:
             rendering = transport.resolved(self.original).apply(mi.TensorXf(self.original)).numpy()
             target = target.seen_as(rendering, target.initial)
         self.prepared = preparation.edit(target)
@@ -484,7 +484,7 @@ class _Edit:
         if self.ceiling:
             again, picture = self.ceiling
             measures["ceiling"] = compare(again[rows], picture[rows])
-        if self.target.coverage is not None:
+        if self.target.painted:
             noise = None if self.noise is None else self.noise[rows]
             coverage = self.target.coverage[rows]
             measures["painted"] = metrics.painted(edited, target, initial, coverage, tonemap, seen, noise)

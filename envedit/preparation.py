@@ -103,8 +103,7 @@ class Preparation:
         with self.clock("fit_s"):
             representation, _ = self._encoded(self.original[self.rows.slice])
         with self.clock("transport_s"):
-            recordings = self._recorded(representation, target)
-        return bool(recordings and recordings.octaves)
+            return bool(self._recorded(representation, target).octaves)
 
     def edit(self, target: Target) -> PreparedEdit:
         """Prepare the edit; the sky is turned where that explains the target better.
@@ -159,7 +158,7 @@ class Preparation:
             return None
         if self.map.locked is not None or self.map.kept is not None:
             return None
-        if chosen == "auto" and target.coverage is not None:  # most of a painted picture is to stay
+        if chosen == "auto" and target.painted:  # most of a painted picture is to stay
             return None
         with self.clock("start_s"):
             self.watch.stage("testing turns of the sky")
@@ -302,7 +301,7 @@ class Preparation:
     def _brightened(self, network, original, free, target):
         """Set the factor of a network's sky; returns notes. What was not painted is to stay, and has none."""
         transport = self.renderer.transport
-        if transport is None or target.coverage is not None or target.photo is not None:
+        if transport is None or target.painted or target.photo is not None:
             return []
         active = np.zeros(original.shape[:2], bool)
         active[self.rows.slice] = True if free is None else free
@@ -334,7 +333,7 @@ class Preparation:
         """Find the lights that explain the target, and for Adam the sky; returns parameters and the run."""
         self.watch.stage("searching for lights")
         explanation = layers.explain(transport)
-        subject = "the target" if layers.edit.rendered else "the paint"
+        subject = "the paint" if layers.edit.target.painted else "the target"
         evidence = f"-2 log evidence {explanation.score:.1f}"
         notes.append(f"likeliest explanation of {subject}: {explanation.name} ({evidence})")
         start = layers.params

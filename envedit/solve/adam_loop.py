@@ -143,7 +143,7 @@ def place_rows(original: mi.TensorXf, crop: mi.TensorXf, first: int) -> mi.Tenso
     last = first + crop.shape[0]
     above = [original[:first]] if first > 0 else []
     below = [original[last:]] if last < original.shape[0] else []
-    return dr.concat([*above, crop, *below])
+    return dr.concat([*above, crop, *below]) if above or below else crop
 
 
 class _Slopes:

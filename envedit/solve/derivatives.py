@@ -67,16 +67,12 @@ class Derivatives:
         """
         if self._last is None or self._last[0] is not point.rendering or self._last[1] != angle:
             pictures, named, profile, maps = self._lights(point, angle)
-            jacobian = self.blocks.jacobian(self._slopes(point))
+            by_gain = point.sky * np.float64(self.layers.changeable)
+            by_gain[: self.layers.shape[0]] = self.layers.gain_slope(self.unknowns.params(point.state))
+            jacobian = self.blocks.jacobian(by_gain.reshape(-1, 3))
             made = Linearisation(pictures, named, profile, jacobian, maps)
             self._last = point.rendering, angle, made
         return self._last[2]
-
-    def _slopes(self, point):
-        """Return the derivative of the sky by the log gain of a texel, (rows * W, 3)."""
-        slopes = point.sky * np.float64(self.layers.changeable)
-        slopes[: self.layers.shape[0]] = self.layers.gain_slope(self.unknowns.params(point.state))
-        return slopes.reshape(-1, 3)
 
     def _profile(self, point, cores):
         """Return the sky's light on every pixel over the mean of its block, (h, w, 3).

@@ -90,11 +90,6 @@ class EditState:
         """The active rows of the map, (rows, W, 3)."""
         return self.original[self.rows.slice]
 
-    @property
-    def rendered(self) -> bool:
-        """Whether the target is a rendering, and not painted."""
-        return self.target.coverage is None
-
     def decode(self, params: Params) -> np.ndarray:
         """Parameters to a whole map on the host, refusing what is not finite."""
         crop = self.representation.decode(params).numpy()
@@ -117,7 +112,7 @@ class EditState:
             self._blocks = {recording: block_jacobian.BlockJacobian(self.representation, traced, shape)}
         target = self.target
         expected = prior.Prior()
-        if not self.rendered:
+        if target.painted:
             expected = prior.of_paint(self.settings.solve.freedom, target.coverage)
         return Problem(
             self.representation,
@@ -126,7 +121,7 @@ class EditState:
             target.aim,
             Likelihood.of_target(target),
             expected,
-            saturates=self.rendered,
+            saturates=not target.painted,
             blocks=self._blocks[recording],
             photo=target.photo,
             clipped=target.clipped,

@@ -93,9 +93,9 @@ def reachable(
     transport: LightTransport,
     original: np.ndarray,
     target: np.ndarray,
-    likelihood: Likelihood | None = None,
-    rows: Rows | None = None,
-    painted: np.ndarray | None = None,
+    likelihood: Likelihood,
+    rows: Rows,
+    painted: np.ndarray,
     rendered: np.ndarray | None = None,
     known: np.ndarray | None = None,
     kept: np.ndarray | None = None,
@@ -111,12 +111,12 @@ def reachable(
         The map, linear radiance.
     target : ndarray (h, w, 3)
         The target, linear radiance.
-    likelihood : Likelihood, optional
-        How much each pixel counts, and the mean of what was not painted; by default all count the same.
-    rows : Rows, optional
-        Active rows; the light of the others stays. All by default.
-    painted : ndarray (h, w), optional
-        Coverage of the region that the request is about, 0 to 1; where None, all pixels that count.
+    likelihood : Likelihood
+        How much each pixel counts, and the mean of what was not painted.
+    rows : Rows
+        Active rows; the light of the others stays.
+    painted : ndarray (h, w)
+        Coverage of the region that the request is about, 0 to 1.
     rendered : ndarray (h, w, 3), optional
         The rendering that was painted on. Its difference from T E is noise, and is no part of the request.
     known : ndarray (H, W, 3), optional
@@ -138,11 +138,9 @@ def reachable(
     # ---- The request
     original = np.ascontiguousarray(original, np.float32)
     active = np.zeros(original.shape[:2], bool)
-    active[slice(None) if rows is None else rows.slice] = True
+    active[rows.slice] = True
     if kept is not None:
         active &= kept < map_regions.KEPT_SHARE
-    likelihood = likelihood or Likelihood(np.ones((*transport.shape, 1), np.float32))
-    painted = likelihood.weight[..., 0] > 0 if painted is None else painted
     transport = transport.resolved(original)
     initial = _rendering(transport, original)
     aim = target.astype(np.float64)

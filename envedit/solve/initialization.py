@@ -69,7 +69,7 @@ def recordings(
     # A path tracer's samples a pixel are not meant for T.
     transport = traced or trace(settings.seed, spp="auto")
     fits = shape[1] >= 4 * CYCLES  # an octave of detail into the map
-    if not fits or target.coverage is not None or settings.representation.cycles != "auto":
+    if not fits or target.painted or settings.representation.cycles != "auto":
         return Recordings(transport)
     pixels, few = scene.width * scene.height, min(SECOND_SPP, transport.spp)
     second = trace(
@@ -109,11 +109,11 @@ def trusted(envmap: np.ndarray, recordings: Recordings, target: Target) -> tuple
     ``envmap`` (H, W, 3) is the map as far as it is solved: images of lights, and caustics, are where the
     lights now are. ``recordings`` has a second one.
     """
-    pictures = []
-    for one in (recordings.transport, recordings.second):
-        pictures.append(one.resolved(envmap).apply(mi.TensorXf(envmap)).numpy())
+    first, second = (
+        one.resolved(envmap).apply(mi.TensorXf(envmap)).numpy()
+        for one in (recordings.transport, recordings.second)
+    )
     share = recordings.second.spp / recordings.transport.spp
-    first, second = pictures
     views = recordings.transport.scene.rows
     weight = pixel_confidence.weights(first, second, share, target.picture, target.noise, views)
     if weight is None:

@@ -79,7 +79,7 @@ class LayersSolver:
                 after_step,
                 most=edit.settings.optimizer.iterations if edit.newton else search.EXPLANATION_STEPS,
             )
-        others = () if edit.rendered else explanation.others
+        others = explanation.others if edit.target.painted else ()
         self.others = tuple(search.completed(problem, one) for one in others)
         return explanation
 
@@ -96,7 +96,7 @@ class LayersSolver:
             If they cannot begin.
         """
         problem = self.edit.problem(transport)
-        return self._steps(problem, begun, sparing=self.edit.rendered).params
+        return self._steps(problem, begun, sparing=not self.edit.target.painted).params
 
     def settle(self) -> float:
         """Go on from :attr:`begun` until no step and no light leads further; returns -2 log evidence."""
@@ -144,7 +144,7 @@ class LayersSolver:
             keep = _Checkpoints(edit, digest, interrupt)
             while True:
                 # Paint is no noisy picture, and asks for what it shows.
-                sparing = edit.rendered and not (run and run.corrected)
+                sparing = not (edit.target.painted or (run and run.corrected))
                 solution = self._steps(edit.problem(), run, sparing, settings.iterations, keep.after_step)
                 following = self._following(solution, interrupt)
                 if following is None:
@@ -167,7 +167,7 @@ class LayersSolver:
 
     def _following(self, solution, interrupt):
         """Return the run that goes on from a solution; None where it is the last."""
-        if not self.edit.rendered:
+        if self.edit.target.painted:
             return self._held_more(solution.run)
         settled = self._settled(solution) if self.edit.target.photo is not None else None
         return settled or self._another(solution, interrupt) or self._corrected(solution)

@@ -38,7 +38,7 @@ from envedit.solve.derivatives import NARROW_ANGLE, Derivatives
 from envedit.solve.likelihood import Likelihood
 from envedit.solve.normal_equations import Normal, solved
 from envedit.solve.prior import AXES, Prior
-from envedit.solve.unknowns import LOG_SATURATIONS, Point, Unknowns, in_numpy
+from envedit.solve.unknowns import LOG_SATURATIONS, Point, Unknowns
 from envedit.solve.white_sky import WhiteSky
 from envedit.targets.photo import Photo
 from envedit.transport.light_transport import COLUMNS_A_LOOK, LightTransport
@@ -335,12 +335,11 @@ class Problem(Unknowns):
             dr.enable_grad([params[name] for name in names])
             sky, _ = self.layers.parts(params)
             dr.backward(dr.sum(sky.array * tensor(light).array))
-            units = [in_numpy(self.layers.scales[name]) for name in names]
             derivatives = [
-                dr.grad(params[name]).numpy() / unit for name, unit in zip(names, units, strict=True)
+                np.float64(dr.grad(params[name]).numpy()) / self.layers.scales[name] for name in names
             ]
         colour = float(derivatives.pop()[0, 0]) if self.saturates else 0.0
-        return np.concatenate([np.float64(one).reshape(-1, 3) for one in derivatives]), colour
+        return np.concatenate([one.reshape(-1, 3) for one in derivatives]), colour
 
     def _precision(self, unknowns):
         """K: of the gain diagonal in luminance, chroma and tint, of lights by their kinds."""

@@ -88,7 +88,7 @@ class _Move:
 def search(
     problem: Problem,
     start: dict,
-    after_step: Callable[[], None] | None = None,
+    after_step: Callable[[], None] = lambda: None,
     most: int = EXPLANATION_STEPS,
     left: Explanation | None = None,
 ) -> Explanation:
@@ -100,7 +100,6 @@ def search(
     """
     steps = min(most, EXPLANATION_STEPS)
     best = left or _descended(problem, {}, gauss_newton.Run(start, start), problem.transport, steps, np.inf)
-    cleared = {name: np.zeros_like(start[name]) for name in ("gain", "saturation")}
     compared: list[Explanation] = [best]
     better = best if best.point.residual is not None else None
     while better:
@@ -108,14 +107,14 @@ def search(
         moves = _moves(problem, best)
         kinds = _best_kinds(moves) if len(compared) == 1 and _unfollowed(problem, best) else ()
         promising = [move for move in moves if move.gain > 0 or (move.light, move.what) in kinds]
-        neighbours = _neighbours(problem, best, promising, after_step, steps, cleared)
+        neighbours = _neighbours(problem, best, promising, after_step, steps, anew=True)
         compared += neighbours
         better = _likelier(best, neighbours)
     return replace(best, others=_others(best, compared))
 
 
 def further(
-    problem: Problem, run: gauss_newton.Run, after_step: Callable[[], None] | None = None
+    problem: Problem, run: gauss_newton.Run, after_step: Callable[[], None] = lambda: None
 ) -> Explanation | None:
     """Find an explanation that is likelier than a solution, whose sky it begins with; None if there is none.
 
@@ -124,7 +123,7 @@ def further(
     point = gauss_newton.reached(problem, run)
     best = Explanation({}, run, point, score(problem, run, point))
     promising = [move for move in _moves(problem, best) if move.gain > 0]
-    return _likelier(best, _neighbours(problem, best, promising, after_step, EXPLANATION_STEPS, {}))
+    return _likelier(best, _neighbours(problem, best, promising, after_step, EXPLANATION_STEPS, anew=False))
 
 
 def completed(problem: Problem, explanation: Explanation) -> Explanation:
@@ -157,18 +156,18 @@ def _unfollowed(problem, best):
     return likelihood.noise(best.point.residual) >= likelihood.largest_noise
 
 
-def _neighbours(problem, best, moves, after_step, steps, sky):
-    """List the explanations one of some moves from another, begun under a sky."""
+def _neighbours(problem, best, moves, after_step, steps, anew):
+    """List the explanations one of some moves from another; ``anew``: begun under the original's sky."""
     neighbours: list[Explanation] = []
     likeliest = best.score
     for move in moves:
-        history = list(best.run.history) if not sky else []
-        run = gauss_newton.Run(move.state | sky, move.centre, history=history)
+        run = gauss_newton.Run(move.state, move.centre, history=list(best.run.history))
+        if anew:
+            run = gauss_newton.Run(_under_original_sky(move.state), move.centre)
         done = move.after(best.done, problem.layers.lights.own)
         neighbours.append(_descended(problem, done, run, best.point.transport, steps, likeliest))
         likeliest = min(likeliest, neighbours[-1].score)
-        if after_step:
-            after_step()
+        after_step()
     return neighbours
 
 
@@ -318,9 +317,8 @@ def _places(problem, state, start, transport):
 
 def _under_the_original(problem, best):
     """Yield moves that raise the likelihood under the gain of the original, all else as it is."""
-    state = best.run.state | {name: np.zeros_like(best.run.state[name]) for name in ("gain", "saturation")}
-    start, transport = best.run.start, best.point.transport
-    lights = problem.layers.lights
+    state, start = _under_original_sky(best.run.state), best.run.start
+    lights, transport = problem.layers.lights, best.point.transport
     spare = [k for k in range(lights.own, lights.count) if k not in problem.added(state)]
     now = _unlikeliness(problem, state, transport)
 
@@ -352,6 +350,11 @@ def _under_the_original(problem, best):
         for there in painted_places.best(problem, state, transport, k):
             more, centre = (_put(lights, one, k, there) for one in (state, start))
             yield _Move(k, ADDED, more, centre, gain=now - there.unlikeliness - ADDED_LIGHT_COST)
+
+
+def _under_original_sky(state):
+    """Return a state with the gain and the saturation of the original."""
+    return state | {name: np.zeros_like(state[name]) for name in ("gain", "saturation")}
 
 
 def _put(lights, state, k, there):

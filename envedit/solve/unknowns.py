@@ -71,7 +71,7 @@ class Unknowns:
 
         The factor of ground, where there is one, is the last of the gain's nodes.
         """
-        real = {k: np.float64(v.numpy()) * in_numpy(self.layers.scales[k]) for k, v in params.items()}
+        real = {k: np.float64(v.numpy()) * self.layers.scales[k] for k, v in params.items()}
         grids = [real.pop(name).reshape(-1, 3) for name in self.grids]
         camera = {"camera": np.zeros((1, 3))} if self.photographed else {}
         return {"saturation": np.zeros((1, 1))} | camera | real | {"gain": np.concatenate(grids)}
@@ -83,7 +83,7 @@ class Unknowns:
         for name, shape in zip(self.grids, shapes, strict=True):
             stop = start + int(np.prod(shape[:-1]))
             grid = state["gain"][start:stop].reshape(shape)
-            unit = in_numpy(self.layers.scales[name])
+            unit = self.layers.scales[name]
             params[name] = tensor(np.divide(grid, unit, out=np.zeros_like(grid), where=unit > 0))
             start = stop
         names = ["turn", "flux", "size"]
@@ -161,8 +161,3 @@ def with_light(state: dict, k: int, **values: Any) -> dict:
     for name, value in values.items():
         state[name][k] = value
     return state
-
-
-def in_numpy(unit: Any) -> Any:
-    """Return a unit of :attr:`.Layers.scales`, a number or a tensor, as numpy has it."""
-    return unit.numpy() if hasattr(unit, "numpy") else np.float64(unit)

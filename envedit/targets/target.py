@@ -62,6 +62,11 @@ class Target:
     photo: photographs.Photo | None = None
 
     @property
+    def painted(self) -> bool:
+        """Whether it is a painted picture, and not a picture of the scene under other light."""
+        return self.coverage is not None
+
+    @property
     def aim(self) -> np.ndarray:
         """The picture that the loop compares with, (h, w, 3)."""
         return self.picture if self.compared is None else self.compared

@@ -60,6 +60,14 @@ def weighed(weight):
     return Likelihood(on_average_one(weight))
 
 
+def reachable(transport, original, target, likelihood=None, rows=None, painted=None, **more):
+    """Return what is within reach; by default every pixel counts the same, and all of the map may change."""
+    likelihood = likelihood or weighed(np.ones((*transport.shape, 1)))
+    rows = rows or Rows.of(len(original))
+    painted = likelihood.weight[..., 0] > 0 if painted is None else painted
+    return feasibility.reachable(transport, original, target, likelihood, rows, painted, **more)
+
+
 def descend(a, b, sweeps=500):
     """Solve min |a x - b| with x >= 0, one coordinate at a time."""
     x, rest, power = np.zeros(a.shape[1]), b.copy(), (a * a).sum(axis=0)
@@ -93,7 +101,7 @@ def test_the_solution_is_that_of_coordinate_descent(dense, envmap, rng, monkeypa
     weight = rng.random((*PIXELS, 1))
     monkeypatch.setattr(feasibility, "SHARP_SAMPLES", 0)  # every texel by itself
     monkeypatch.setattr(feasibility, "STEPS", 100)
-    found = feasibility.reachable(dense, envmap, target, weighed(weight))
+    found = reachable(dense, envmap, target, weighed(weight))
     request = feasibility._Request(render(dense, envmap), target, weighed(weight), np.ones(PIXELS))
     w = request.weights(found.picture)  # as linearised where the solution is
 
@@ -112,7 +120,7 @@ def test_the_solution_is_that_of_coordinate_descent(dense, envmap, rng, monkeypa
 def test_what_a_map_makes_is_within_reach(dense, envmap, rng):
     true = (0.2 + rng.random(envmap.shape)) * [1.2, 1, 0.7]
     target = render(dense, true)
-    found = sane(feasibility.reachable(dense, envmap, target), envmap)
+    found = sane(reachable(dense, envmap, target), envmap)
     assert found.share > 0.9
     assert found.warning is None
     np.testing.assert_allclose(found.picture, render(dense, found.envmap), rtol=1e-5)
@@ -123,10 +131,10 @@ def test_a_map_that_is_known_is_within_reach_whatever_the_solution_finds(dense, 
     monkeypatch.setattr(feasibility, "STEPS", 0)  # stays at the original
     other = (envmap * rng.uniform(0.3, 3, envmap.shape)).astype(np.float32)
     target = render(dense, other)
-    assert feasibility.reachable(dense, envmap, target).share == 0
-    found = feasibility.reachable(dense, envmap, target, known=other)
+    assert reachable(dense, envmap, target).share == 0
+    found = reachable(dense, envmap, target, known=other)
     assert found.share > 0.999 and np.array_equal(found.envmap, other)
-    assert feasibility.reachable(dense, envmap, target, known=envmap).share == 0
+    assert reachable(dense, envmap, target, known=envmap).share == 0
 
 
 def test_what_is_called_after_every_step_may_end_the_search(dense, envmap):
@@ -134,14 +142,14 @@ def test_what_is_called_after_every_step_may_end_the_search(dense, envmap):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        feasibility.reachable(dense, envmap, 2 * render(dense, envmap), after_step=stop)
+        reachable(dense, envmap, 2 * render(dense, envmap), after_step=stop)
 
 
 def test_share_is_of_display_values_in_the_painted_region(dense, envmap, rng):
     initial, painted = render(dense, envmap), rng.random(PIXELS)
     target = initial * np.where(rng.random((*PIXELS, 1)) < 0.5, 0.5, 1.4)
     found = sane(
-        feasibility.reachable(dense, envmap, target, weighed(0.3 + painted[..., None]), painted=painted),
+        reachable(dense, envmap, target, weighed(0.3 + painted[..., None]), painted=painted),
         envmap,
     )
     wanted = 1 - apart(found.picture, target, painted) / apart(initial, target, painted)
@@ -151,12 +159,12 @@ def test_share_is_of_display_values_in_the_painted_region(dense, envmap, rng):
 
 def test_only_the_rows_that_may_change_do(dense, envmap):
     target = 0.6 * render(dense, envmap)
-    found = sane(feasibility.reachable(dense, envmap, target, rows=Rows(1, 2, HEIGHT)), envmap)
+    found = sane(reachable(dense, envmap, target, rows=Rows(1, 2, HEIGHT)), envmap)
     fixed = np.ones((HEIGHT, WIDTH), bool)
     fixed[1:3] = False
     np.testing.assert_array_equal(found.envmap[fixed], envmap[fixed])
     assert (found.envmap[~fixed] != envmap[~fixed]).mean() > 0.9
-    assert found.share < feasibility.reachable(dense, envmap, target).share
+    assert found.share < reachable(dense, envmap, target).share
 
 
 # ---- what is left ------------------------------------------------------------------------------------------
@@ -171,7 +179,7 @@ def test_two_pixels_that_see_the_same_cannot_differ(dense, envmap):
     painted = np.zeros(PIXELS)
     painted[1, 1] = 1
     weight = np.where(painted > 0, 1, 100)[..., None]
-    found = sane(feasibility.reachable(transport, envmap, target, weighed(weight), painted=painted), envmap)
+    found = sane(reachable(transport, envmap, target, weighed(weight), painted=painted), envmap)
     assert found.share < 0.05
     assert (found.residual[1, 1] < -0.05).all()
     assert f"only {int(100 * found.share)} %" in found.warning and "darker" in found.warning
@@ -179,7 +187,7 @@ def test_two_pixels_that_see_the_same_cannot_differ(dense, envmap):
     assert shown[2] == 1 and shown[0] < 0.8  # blue
 
     target[1, 1] *= 3  # half as bright again
-    found = sane(feasibility.reachable(transport, envmap, target, weighed(weight), painted=painted), envmap)
+    found = sane(reachable(transport, envmap, target, weighed(weight), painted=painted), envmap)
     assert found.share < 0.05 and "brighter" in found.warning
     shown = preview.unreachable(found)[1, 1]
     assert shown[0] == 1 and shown[2] < 0.8  # red
@@ -187,7 +195,7 @@ def test_two_pixels_that_see_the_same_cannot_differ(dense, envmap):
 
 def test_other_lamps_cannot_be_darkened(dense, envmap):
     transport = Dense(dense.matrix, lamps=0.3)
-    found = sane(feasibility.reachable(transport, envmap, np.full((*PIXELS, 3), 0.05)), envmap)
+    found = sane(reachable(transport, envmap, np.full((*PIXELS, 3), 0.05)), envmap)
     np.testing.assert_allclose(found.picture, 0.3, atol=0.02)
     assert "darker" in (found.warning or "darker") and found.too_dark == 0
 
@@ -199,7 +207,7 @@ def test_white_is_any_value_above(dense, envmap, white):
     painted = np.zeros(PIXELS)
     painted[2, 3] = 1
     weight = np.where(painted > 0, 1, 1e-3)[..., None]
-    found = sane(feasibility.reachable(dense, envmap, target, weighed(weight), painted=painted), envmap)
+    found = sane(reachable(dense, envmap, target, weighed(weight), painted=painted), envmap)
     assert found.share > 0.9 and (found.picture[2, 3] < 3).all()
 
 
@@ -207,36 +215,36 @@ def test_white_is_any_value_above(dense, envmap, white):
 
 
 def test_nothing_asked_is_all_within_reach(dense, envmap):
-    found = sane(feasibility.reachable(dense, envmap, render(dense, envmap)), envmap)
+    found = sane(reachable(dense, envmap, render(dense, envmap)), envmap)
     assert found.share == 1
     np.testing.assert_array_equal(found.envmap, envmap)
 
 
 def test_the_noise_of_the_painted_rendering_is_not_asked_for(dense, envmap, rng):
     noisy = render(dense, envmap) * rng.uniform(0.8, 1.2, (*PIXELS, 3))
-    assert feasibility.reachable(dense, envmap, noisy, rendered=noisy).share == 1
-    wanted = feasibility.reachable(dense, envmap, 0.8 * noisy).share
-    assert feasibility.reachable(dense, envmap, 0.8 * noisy, rendered=noisy).share > wanted + 0.05
+    assert reachable(dense, envmap, noisy, rendered=noisy).share == 1
+    wanted = reachable(dense, envmap, 0.8 * noisy).share
+    assert reachable(dense, envmap, 0.8 * noisy, rendered=noisy).share > wanted + 0.05
 
 
 def test_black_maps_and_black_targets(dense, envmap):
     black, none = np.zeros_like(envmap), np.zeros((*PIXELS, 3))
-    assert sane(feasibility.reachable(dense, black, none), envmap).share == 1
-    assert sane(feasibility.reachable(dense, envmap, none), envmap).share > 0.8
-    grown = sane(feasibility.reachable(dense, black, render(dense, envmap)), envmap)
+    assert sane(reachable(dense, black, none), envmap).share == 1
+    assert sane(reachable(dense, envmap, none), envmap).share > 0.8
+    grown = sane(reachable(dense, black, render(dense, envmap)), envmap)
     assert grown.share > 0.8
 
 
 @pytest.mark.parametrize("scale", [1e-30, 1e-6, 65504, 1e6])
 def test_radiance_of_any_size(dense, envmap, scale):
     target = np.full((*PIXELS, 3), 0.3)
-    assert sane(feasibility.reachable(dense, envmap * np.float32(scale), target), envmap).share > 0.7
+    assert sane(reachable(dense, envmap * np.float32(scale), target), envmap).share > 0.7
 
 
 def test_nothing_seen(dense, envmap):
     target = 0.5 * render(dense, envmap)
     blind = Dense(np.zeros_like(dense.matrix), lamps=0.2)
-    found = sane(feasibility.reachable(blind, envmap, target + 0.1), envmap)
+    found = sane(reachable(blind, envmap, target + 0.1), envmap)
     assert found.share == 0
     np.testing.assert_array_equal(found.envmap, envmap)
 
@@ -310,7 +318,7 @@ def test_what_is_promised_is_seen_in_a_fresh_rendering(name, matte, rng):
     target, painted, low, high = requests(initial, turned, rng)[name]
     weight = (painted + 0.3 * (1 - painted))[..., None]
     rows = Rows(0, ROWS, len(original))
-    found = sane(feasibility.reachable(transport, original, target, weighed(weight), rows, painted), original)
+    found = sane(reachable(transport, original, target, weighed(weight), rows, painted), original)
     fresh = lit.render(found.envmap, spp=256, seed=9, max_depth=3)
     kept = 1 - apart(fresh, target, painted) / apart(initial, target, painted)
     assert low <= found.share <= high
@@ -330,7 +338,7 @@ def test_the_mean_of_what_is_not_painted_is_held(dense, envmap):
     weight = (painted + 0.01 * (1 - painted)).astype(np.float32)
     asked = transport, envmap, target
     shares = [
-        feasibility.reachable(*asked, likelihood, painted=painted[..., 0]).share
+        reachable(*asked, likelihood, painted=painted[..., 0]).share
         for likelihood in (weighed(weight), Likelihood.of_paint(weight, painted, initial, target))
     ]
     assert shares[0] > 0.6 and shares[1] < 0.3

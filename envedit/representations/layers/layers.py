@@ -183,13 +183,17 @@ class Layers:
 
     @functools.cached_property
     def scales(self) -> dict[str, Any]:
-        """Unit of each parameter, a number or a tensor of its shape."""
-        units = SCALES | self.gain.scales() | ({"ground": GROUND} if self.ground_light else {})
-        return {name: unit if np.ndim(unit) == 0 else tensor(unit) for name, unit in units.items()}
+        """Unit of each parameter, a number or an array of its shape."""
+        return SCALES | self.gain.scales() | ({"ground": GROUND} if self.ground_light else {})
+
+    @functools.cached_property
+    def _scales(self):
+        """The same on the device."""
+        return {name: unit if np.ndim(unit) == 0 else tensor(unit) for name, unit in self.scales.items()}
 
     def _real(self, params):
         """Return parameters as logarithms and radians."""
-        return {name: value * self.scales[name] for name, value in params.items()}
+        return {name: value * self._scales[name] for name, value in params.items()}
 
     def light_moves(self, params: dict) -> list[tuple[np.ndarray, np.ndarray, float]]:
         """List where each light of the map was and is, unit vectors (3,), and the mean factor of its flux."""

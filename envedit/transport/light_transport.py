@@ -32,7 +32,7 @@ import numpy as np
 
 from envedit import config
 from envedit.core import latlong, seeds
-from envedit.core.array_cache import DiskCache, holds
+from envedit.core.array_cache import DiskCache
 from envedit.core.arrays import tensor
 from envedit.core.errors import ConfigError, InputError, counted
 from envedit.core.radiance import require_radiance, require_unmasked
@@ -209,7 +209,7 @@ class LightTransport:
         # ---- The recording, from disk or traced
         key = origin | {"part": "recording"} | plan.key()
         transport._stored = cache, key | {"part": "overview"}
-        recording = cache.load(key, transport._whole)
+        recording = cache.load(key)
         if recording is None:
             offset = other_light(scene, plan.lamps, seed)
             offset = np.zeros(1, np.float32) if offset is None else offset.ravel()
@@ -253,19 +253,6 @@ class LightTransport:
             "offset": self._offset.numpy(),
             **{f"{part}/{name}": array for part, arrays in parts.items() for name, array in arrays.items()},
         }
-
-    def _whole(self, arrays):
-        """Return whether :meth:`_take` can take arrays from disk."""
-        pixels = self.shape[0] * self.shape[1]
-        own = {k: a for k, a in arrays.items() if "/" not in k}
-        kept = {"influence": ("f4", self.grid.shape), "lost": ("i8", ()), "offset": ("f4", (None,))}
-        shapes = {"forward": (pixels, self.grid.texels), "reverse": (self.grid.texels, pixels)}
-        return (
-            holds(own, kept)
-            and own["offset"].size in (1, 3 * pixels)
-            and own["lost"] >= 0
-            and all(ColourMatrix.whole(_under(arrays, part), shape) for part, shape in shapes.items())
-        )
 
     def _take(self, arrays):
         """Take the first recording from arrays."""
@@ -328,7 +315,7 @@ class LightTransport:
         if self._overview is None:
             cache, key = self._stored
             overview = Overview(self.shape, self.grid.shape, self.scene.rows)
-            stored = cache.load(key, overview.fits)
+            stored = cache.load(key)
             if stored is None:
                 stored = {"matrix": overview.summed(self.forward)}
                 cache.store(key, stored)

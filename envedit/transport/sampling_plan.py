@@ -13,7 +13,7 @@ import drjit as dr
 import numpy as np
 
 from envedit.core import latlong, seeds
-from envedit.core.array_cache import DiskCache, holds
+from envedit.core.array_cache import DiskCache
 from envedit.core.errors import ConfigError, InputError
 from envedit.scene.scene import Scene
 from envedit.transport import recording
@@ -100,13 +100,7 @@ def white_sky(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Measure the light by row of a map (H, W) and by bounce, or take it from disk; see :func:`pilot`."""
     height, width = shape
-    known = {"by_row": ("f8", (height,)), "by_bounce": ("f8", (None,))}
-    light = cache.load(
-        key,
-        lambda arrays: (
-            holds(arrays, known) and len(arrays["by_bounce"]) > MAX_BOUNCES and arrays["by_bounce"].sum() > 0
-        ),
-    )
+    light = cache.load(key)
     if light is None:
         sphere = latlong.solid_angles(height, width)
         by_row, by_bounce = pilot(scene, Grid(height, width, scene.to_world, sphere), seed)

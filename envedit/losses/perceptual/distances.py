@@ -18,7 +18,7 @@ from envedit.core.arrays import tensor
 from envedit.core.errors import InputError
 from envedit.core.types import DrArray, FilePath, Shape, Tensor
 from envedit.losses.perceptual import weights
-from envedit.losses.perceptual.backbones import Backbone
+from envedit.losses.perceptual.backbones import Backbone, Stack
 from envedit.losses.perceptual.convolution import Divisor
 from envedit.losses.ssim import KnownGradient
 
@@ -98,7 +98,7 @@ class _DistsTo:
     """The distance to a fixed image: value, and gradient by hand."""
 
     def __init__(self, dists, reference):
-        self._stack = dists.backbone.stack(reference.shape[0], reference.shape[1], "hanning")
+        self._stack = Stack(dists.backbone, *reference.shape[:2], "hanning")
         self._weights = dists.weights
         self._reference = []
         for y, channels in self._features(dr.detach(reference.array))[0]:
@@ -192,7 +192,7 @@ class Lpips:
 
     def distance(self, a: Tensor, b: Tensor) -> DrArray:
         """Return the distance of two images ``(H, W, 3)`` in their precision, as a size-1 array."""
-        stack = self.backbone.stack(a.shape[0], a.shape[1], "max")
+        stack = Stack(self.backbone, *a.shape[:2])
         features = [stack.taps(stack.forward(_normalised(image.array))) for image in (a, b)]
         score = mi.Float64(0)
         for (x, pixels, channels), (y, _, _), head in zip(*features, self.heads, strict=True):

@@ -1,20 +1,14 @@
 """Light transport T: a rendering is linear in the environment map, I = T E + I_0.
 
-T is traced once for a scene, its camera and a texel grid, without looking at any map; then rendering is a
-matrix product and its adjoint is exact. Nothing changes from step to step, so that the objective has no Monte
-Carlo noise (see docs/light_transport.md).
+T is traced once for a scene, its camera and a texel grid, without looking at any map. Of its two tiers
+(docs/light_transport.md) the coarse one (``recording.py``) renders the smooth part of a map with little
+error, but a single bright texel is hit by few samples; :meth:`LightTransport.resolved` adds columns of the
+exact one (``exact_columns.py``) for the texels that are bright in a given map:
 
-Two tiers, both unbiased for paths up to the path depth:
+    T E = T_coarse (E outside the columns) + T_exact (E inside them)
 
-* the **coarse** tier is a sparse matrix of recorded samples (``recording.py``), spread evenly over
-  directions; it renders the smooth part of a map with little error, but a single bright texel is hit by few
-  samples;
-* the **exact** tier holds columns of T (``exact_columns.py``), one ray per path vertex to that very texel.
-  :meth:`LightTransport.resolved` adds them for the texels that are bright in a given map.
-
-T E = T_coarse (E outside the columns) + T_exact (E inside them). What it costs follows the light, not the
-grid. A transport is a value: what it renders depends on the map alone. Others that differ in their columns
-share its recording and the columns in memory, which are traced when they are used first.
+A transport is a value: what it renders depends on the map alone. Others that differ in their columns share
+its recording and the columns in memory, which are traced when they are used first.
 """
 
 from __future__ import annotations

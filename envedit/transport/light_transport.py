@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
-from numbers import Integral
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -25,10 +24,11 @@ import mitsuba as mi
 import numpy as np
 
 from envedit import config
+from envedit.config.validators import MOST_DIM, Integer, named
 from envedit.core import latlong, seeds
 from envedit.core.array_cache import DiskCache
 from envedit.core.arrays import tensor
-from envedit.core.errors import ConfigError, InputError, counted
+from envedit.core.errors import InputError, counted
 from envedit.core.radiance import require_radiance, require_unmasked
 from envedit.core.types import ArrayLike, Progress
 from envedit.scene import built_scene
@@ -159,8 +159,8 @@ class LightTransport:
         Raises
         ------
         ConfigError
-            ``spp`` or ``max_depth`` is below 1, the grid or ``seed`` is no whole number, ``memory_gb`` is no
-            number, or the scene's parameters or sensors cannot be used.
+            An argument is of another type or out of its range, or the scene's parameters or sensors cannot
+            be used.
         InputError
             The scene cannot be loaded, no pixel receives light from the environment, T does not fit into
             ``memory_gb``, or the grid is smaller than Mitsuba takes.
@@ -174,18 +174,12 @@ class LightTransport:
         if mi.variant() is None:
             mi.set_variant("llvm_ad_rgb")
         scene = built_scene.load(scene, config.Scene())
-        for side, texels in (("height", height), ("width", width)):
-            if not _whole(texels, 1):
-                raise ConfigError(f"{side}: got {texels!r}, expected a whole number of texels")
+        height, width = (
+            named(side, Integer(1, MOST_DIM), n) for side, n in (("height", height), ("width", width))
+        )
         latlong.check_envmap_size(height, width)
-        if not _whole(seed, 0):
-            raise ConfigError(f"seed: got {seed!r}, expected a whole number of at least 0")
-        memory_gb = sampling_plan.allowed(memory_gb)
-        for name, value in (("spp", spp), ("max_depth", max_depth)):
-            if value != "auto" and not _whole(value, 1):
-                raise ConfigError(
-                    f"renderer.{name}: got {value!r}, expected a whole number of at least 1, or auto"
-                )
+        renderer = config.Renderer(spp=spp, max_depth=max_depth, memory_gb=memory_gb)
+        config.Config(seed=seed)  # checks it
 
         # ---- How T is sampled, by a few paths under a white sky
         cache = DiskCache(None if folder is None else Path(folder))
@@ -197,7 +191,8 @@ class LightTransport:
         }
         grid = height, width
         light = sampling_plan.white_sky(cache, origin | {"part": "pilot"}, scene, grid, seed)
-        plan = sampling_plan.choose(scene, grid, light, spp, max_depth, memory_gb, few)
+        allowed = sampling_plan.allowed(renderer.memory_gb)
+        plan = sampling_plan.choose(scene, grid, light, renderer.spp, renderer.max_depth, allowed, few)
         transport = cls(scene, Grid(height, width, scene.to_world, plan.mass), plan, seed)
 
         # ---- The recording, from disk or traced
@@ -551,11 +546,6 @@ class LightTransport:
         tolerance = self.tolerance if tolerance is None else tolerance
         radiance, omega = self._radiance(envmap)
         return bright_texels.brightest(radiance, omega, self._samples, tolerance)
-
-
-def _whole(value, least):
-    """Return whether a value is a whole number that is not less than ``least``."""
-    return isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= least
 
 
 def _within(numbers, least, most):

@@ -14,7 +14,7 @@ import numpy as np
 
 from envedit.core import latlong, seeds
 from envedit.core.array_cache import DiskCache
-from envedit.core.errors import ConfigError, InputError
+from envedit.core.errors import InputError
 from envedit.scene.scene import Scene
 from envedit.transport import recording
 from envedit.transport.sparse_matrix import SLICE
@@ -216,12 +216,8 @@ def choose_samples(scene: Scene, spp: int | str, texels: int, memory_gb: float) 
 
 
 def allowed(memory_gb: float | str) -> float:
-    """Return the GB that a setting allows; ConfigError if it is no number."""
-    if memory_gb == "auto":
-        return AUTO_GB
-    if isinstance(memory_gb, str):
-        raise ConfigError(f"renderer.memory_gb: got {memory_gb!r}, expected a number, or auto")
-    return float(memory_gb)
+    """Return the GB that a setting allows."""
+    return AUTO_GB if isinstance(memory_gb, str) else memory_gb
 
 
 def most_samples(pixels: int, memory_gb: float) -> int:

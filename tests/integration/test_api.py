@@ -235,8 +235,8 @@ def test_codes_of_a_picture_as_radiance_are_warned_of():
         (lambda: envedit.sunsky(63), "input.width: got 63, expected an even integer"),
         (lambda: envedit.LightTransport.build("sphere", spp="many"), "renderer.spp: got 'many', expected"),
         (lambda: envedit.LightTransport.build(3), "scene: got int, expected a file, a dict"),
-        (lambda: envedit.LightTransport.build("sphere", 32.0), "height: got 32.0, expected a whole number"),
-        (lambda: envedit.LightTransport.build("sphere", seed="a"), "seed: got 'a', expected a whole number"),
+        (lambda: envedit.LightTransport.build("sphere", 32.0), "height: got 32.0, expected an integer"),
+        (lambda: envedit.LightTransport.build("sphere", seed="a"), "seed: got 'a', expected an integer"),
         (lambda: envedit.LightTransport.build("sphere", memory_gb="a"), "memory_gb: got 'a', expected a"),
     ],
 )

@@ -148,7 +148,7 @@ def test_trained_networks_score_as_the_authors_programs(data):
     pairs = list(drawn.pairs())
     assert drawn.checksum(image for pair in pairs for image in pair) == images
     vgg, heads = Backbone.load("vgg", folder / installed.VGG), str(folder / installed.HEADS)
-    alex = Lpips("alex", folder / installed.BACKBONES["alex"], heads.format("alex"))
+    alex = Lpips("alex", Backbone.load("alex", folder / installed.BACKBONES["alex"]), heads.format("alex"))
     dists = Dists(vgg, folder / installed.DISTS)
     measures = alex, Lpips("vgg", vgg, heads.format("vgg")), lambda a, b: dists.against(b)(a)
     found = [[np.ravel(measure(single(x), single(y)))[0] for measure in measures] for x, y in pairs]
@@ -238,7 +238,7 @@ def test_a_backbone_is_loaded_from_a_file(backbones, folder):
     np.savez(folder / "alexnet.npz", **state)
     x, y, _ = drawn.images(40, 40)
     expected = Lpips("alex", backbones["alex"], folder / "alex.npz")(x, y)
-    assert Lpips("alex", folder / "alexnet.npz", folder / "alex.npz")(x, y) == expected
+    assert Lpips("alex", Backbone.load("alex", folder / "alexnet.npz"), folder / "alex.npz")(x, y) == expected
     with pytest.raises(InputError, match=r"'features.0.weight' has the shape \(64, 3, 3, 3\), in AlexNet"):
         np.savez(folder / "mixed.npz", **(state_of("alex") | {"features.0.weight": np.zeros((64, 3, 3, 3))}))
         Backbone.load("alex", folder / "mixed.npz")

@@ -98,7 +98,8 @@ class _DistsTo:
     """The distance to a fixed image: value, and gradient by hand."""
 
     def __init__(self, dists, reference):
-        self._stack = Stack(dists.backbone, *reference.shape[:2], "hanning")
+        height, width, _ = reference.shape
+        self._stack = Stack(dists.backbone, height, width, "hanning")
         self._weights = dists.weights
         self._reference = []
         for y, channels in self._features(dr.detach(reference.array))[0]:
@@ -173,13 +174,13 @@ class Lpips:
     the authors' PyTorch code with ``normalize=True``: features of every tapped layer, divided by their length
     at each pixel; squared differences, weighted by channel, averaged over pixels, summed over layers.
 
-    ``kind`` is "alex" or "vgg", ``backbone`` the network or its file (`Backbone.load`), the heads' file an
+    ``kind`` is "alex" or "vgg", ``backbone`` the network, the heads' file an
     ``npz`` with ``lin0.model.1.weight`` (1, C, 1, 1) and so on, one for every layer; errors as of
     :func:`.weights.read`.
     """
 
-    def __init__(self, kind: str, backbone: FilePath | Backbone, heads_file: FilePath):
-        self.backbone = backbone if isinstance(backbone, Backbone) else Backbone.load(kind, backbone)
+    def __init__(self, kind: str, backbone: Backbone, heads_file: FilePath):
+        self.backbone = backbone
         shapes: dict[str, Shape] = {
             f"lin{i}.model.1.weight": (1, c, 1, 1) for i, c in enumerate(self.backbone.channels)
         }

@@ -15,10 +15,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from envedit import config, inputs
-from envedit.config.validators import show
+from envedit.config.validators import Integer, named, show
 from envedit.core.errors import ConfigError, InputError
 from envedit.core.radiance import require_unmasked
 from envedit.images import analytic_sky, images
+from envedit.images.headers import MAX_SIDE
 from envedit.pipeline import Watch, run
 from envedit.representations.siren import fit as siren
 from envedit.representations.siren.fit import Fitted
@@ -261,6 +262,8 @@ def load_map(file: str | PathLike[str], width: int | None = None) -> np.ndarray:
     ConfigError
         ``width`` is odd or out of range.
     """
+    if width is not None:
+        width = named("width", Integer(6, MAX_SIDE, even=True), width)
     envmap, info = images.load_envmap(file, width)
     for line in info["warnings"]:
         warnings.warn(f"{info['path']}: {line}", stacklevel=2)

@@ -10,7 +10,6 @@ import numpy as np
 
 from envedit import config
 from envedit.core import array_cache, extensions
-from envedit.core.array_cache import holds
 from envedit.core.errors import ConfigError, InputError
 from envedit.core.types import Progress
 from envedit.scene.path_tracer import PathTracer
@@ -90,9 +89,9 @@ class StoredRenderer:
     def restore(self, state: dict) -> None:
         """Continue from an earlier :meth:`state`; InputError if it is no state of such a renderer."""
         own = {name: np.asarray(value) for name, value in state.items()}
-        names = {"columns", "paths", "looks", "epoch"}
-        looks = {"looks": ("u1", self._looks.shape), "epoch": ("i8", ())}
-        known = own.keys() == names and holds({name: own[name] for name in looks}, looks)
+        kinds = {name: (array.dtype, array.shape) for name, array in own.items()}
+        looks = {"looks": (np.uint8, self._looks.shape), "epoch": (np.int64, ())}
+        known = own.keys() == {"columns", "paths", *looks} and kinds == kinds | looks
         if not (known and 0 <= own["epoch"] < 2**31):
             raise InputError("the checkpoint is not of this light transport: run without --resume")
         transport = self.transport

@@ -45,9 +45,10 @@ def main(argv: list[str] | None = None) -> int:
 
 def _sky(arguments, console):
     from envedit import api
+    from envedit.config.validators import MOST_DIM, Integer, named
     from envedit.maps import map_file
 
-    width = _checked_width(arguments.width)
+    width = named("--width", Integer(6, MOST_DIM, even=True), arguments.width)
     azimuth, elevation = _sun(arguments)
     path = map_file.output_path(arguments.out, "sky", [], arguments.overwrite)
     doctor.select()
@@ -55,16 +56,6 @@ def _sky(arguments, console):
     map_file.write(path, sky)
     console.facts |= {"files": {"map": str(path)}, "azimuth": azimuth, "elevation": elevation}
     console.say(f"sun at azimuth {azimuth:.2f}, elevation {elevation:.2f} degrees; {path}")
-
-
-def _checked_width(width):
-    """Return a width of a map; ConfigError, which names the option, for one that cannot be."""
-    from envedit import config
-
-    try:
-        return config.Input(width=width).width
-    except ConfigError:
-        raise ConfigError(f"--width: got {width}, expected an even integer from 6 to 16384") from None
 
 
 def _sun(arguments):

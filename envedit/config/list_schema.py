@@ -260,7 +260,6 @@ _ELLIPSE = Either(
     Numbers(*_POINT.checks, *_RADII),
     Numbers(*_POINT.checks, *_RADII, Number(-360, 360)),
 )
-_CORNERS = Numbers(*4 * [_COORDINATE])
 _LINEAR = Numbers(*3 * [Number(0, 1e6)])
 
 
@@ -282,21 +281,20 @@ class Color(Check):
         return {"anyOf": [_LINEAR.schema(), {"type": "string", "pattern": "^#[0-9a-fA-F]{6}$"}]}
 
 
-class Rectangle(Check):
+class Rectangle(Numbers):
     """Upper left and lower right corner."""
 
-    words = "[x0, y0, x1, y1] with x1 above x0 and y1 above y0"
+    def __init__(self) -> None:
+        super().__init__(*4 * [_COORDINATE])
 
     def __call__(self, value: Any) -> list[float]:
-        if not isinstance(value, list | tuple) or len(value) != 4:
-            raise WantedError(str(self))
-        x0, y0, x1, y1 = _CORNERS(value)
+        x0, y0, x1, y1 = corners = super().__call__(value)
         if x1 <= x0 or y1 <= y0:
             raise WantedError(str(self))
-        return [x0, y0, x1, y1]
+        return corners
 
-    def schema(self) -> Schema:
-        return _CORNERS.schema()
+    def __str__(self) -> str:
+        return "[x0, y0, x1, y1] with x1 above x0 and y1 above y0"
 
 
 STROKE_SHAPES = ("points", "polygon", "ellipse", "rectangle")

@@ -74,8 +74,16 @@ def loads(
     Relative paths start from ``base_dir``. ``name`` is what errors call the document; its stem names the
     output folder.
     """
+    return from_dict(parsed(text, name), base_dir, name, preset, overrides)
+
+
+def parsed(text: str, name: str) -> dict[str, Any]:
+    """Parse the text of a file; ConfigError with its name if it is not TOML."""
+    if found := _LONG_KEY.search(text):
+        row = text.count("\n", 0, found.start()) + 1
+        raise ConfigError(f"{name}: not TOML: a key of more than 100 parts (at line {row})")
     try:
-        table = _parsed(text)
+        return tomllib.loads(text)
     except RecursionError:
         raise ConfigError(f"{name}: not TOML: nested too deeply") from None
     except ValueError as error:  # TOMLDecodeError, or an integer of thousands of digits
@@ -83,14 +91,6 @@ def loads(
         if len(reason) > 200:  # it may hold a key of any length; its end says where
             reason = f"{reason[:120]} ... {reason[-60:]}"
         raise ConfigError(f"{name}: not TOML: {reason}") from None
-    return from_dict(table, base_dir, name, preset, overrides)
-
-
-def _parsed(text: str) -> dict[str, Any]:
-    if found := _LONG_KEY.search(text):
-        row = text.count("\n", 0, found.start()) + 1
-        raise ValueError(f"a key of more than 100 parts (at line {row})")
-    return tomllib.loads(text)
 
 
 def from_dict(
@@ -189,11 +189,11 @@ def parse_override(text: str) -> tuple[tuple[str, ...], Any]:
         raise ConfigError(f"--set {show(text)}: expected table.key=value, such as fit.epochs=100")
     raw = raw.strip()
     try:
-        parsed = _parsed(f"value = {raw}")
-    except (ValueError, RecursionError):
+        table = parsed(f"value = {raw}", "--set")
+    except ConfigError:
         return keys, raw
     # A value with a line break could smuggle in a second key.
-    return keys, parsed["value"] if parsed.keys() == {"value"} else raw
+    return keys, table["value"] if table.keys() == {"value"} else raw
 
 
 # ---- Writing -----------------------------------------------------------------------------------------------

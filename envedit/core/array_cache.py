@@ -2,8 +2,8 @@
 
 An entry is an uncompressed npz file that holds the whole key beside the arrays. Damaged, truncated or foreign
 files are ignored, as are those in a folder that others may write to; an entry that cannot be written only
-costs the time to make its arrays again. The CRC of an npz file detects damage, not intent: callers check
-shapes and ranges too (``is_whole``).
+costs the time to make its arrays again. A CRC detects damage, not intent: the folder must be the user's own
+(``SECURITY.md``).
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ import os
 import re
 import stat
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -41,21 +40,16 @@ class DiskCache:
     def __init__(self, folder: Path | None, most_bytes: int = MOST_BYTES):
         self.folder, self.most_bytes = folder, most_bytes
 
-    def load(
-        self, key: dict, is_whole: Callable[[dict[str, np.ndarray]], bool] | None = None
-    ) -> dict[str, np.ndarray] | None:
+    def load(self, key: dict) -> dict[str, np.ndarray] | None:
         """Return the arrays that were stored under a key; None if there are none, or none that are whole.
 
-        ``key`` is what they were made from, as JSON knows it. ``is_whole`` returns whether arrays are such as
-        :meth:`store` was given: names, types, shapes and ranges; what it raises is a no.
+        ``key`` is what they were made from, as JSON knows it.
         """
         if self.folder is None or not _private(self.folder):
             return None
         path = self._path(key)
         try:
             arrays = _read(path, _text(key))
-            if is_whole is not None and not is_whole(arrays):
-                return None
         except Exception:  # what a header that is believed can lead to has many names
             return None
         with contextlib.suppress(OSError):  # somebody else's folder is as good to read from
@@ -126,20 +120,6 @@ def _read(path, text):
         if archive.zip.testzip() is not None or archive[KEY].item() != text:
             raise ValueError
         return {name: archive[name] for name in archive.files if name != KEY}
-
-
-def holds(arrays: dict[str, np.ndarray], expected: dict[str, tuple]) -> bool:
-    """Return whether arrays have these names, types and shapes, and hold finite numbers.
-
-    ``expected`` has type and shape by name; a length of None in a shape is any.
-    """
-    return arrays.keys() == expected.keys() and all(
-        array.dtype == np.dtype(dtype)
-        and len(array.shape) == len(shape)
-        and all(size in (None, length) for length, size in zip(array.shape, shape, strict=True))
-        and bool(np.isfinite(array).all())
-        for array, (dtype, shape) in ((arrays[name], expected[name]) for name in expected)
-    )
 
 
 def under(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:

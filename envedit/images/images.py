@@ -9,16 +9,15 @@ from __future__ import annotations
 
 import os
 import zlib
-from numbers import Integral
 
 import numpy as np
 
 from envedit.core import latlong, primaries, radiance
 from envedit.core.atomic_files import write_atomically
-from envedit.core.errors import ConfigError, EnveditError, InputError, texels_are
+from envedit.core.errors import EnveditError, InputError, texels_are
 from envedit.core.types import ArrayLike, FilePath, Info
 from envedit.images import exr, ldr, marks, rgbe, tiff
-from envedit.images.headers import MAX_SIDE, damaged, finite, head_of, shown
+from envedit.images.headers import damaged, finite, head_of, shown
 
 FORMATS = (
     ("exr", b"\x76\x2f\x31\x01", exr.read),
@@ -127,11 +126,8 @@ def load_envmap(
     Returns linear radiance (width / 2, width, 3) float32, finite and not negative, and ``info`` as of
     :func:`read` (``size`` is the file's), with ``repaired`` and ``clipped``, numbers of texels. InputError if
     the file cannot be read, is not 2:1 to a texel, is smaller than 6 x 3, or holds texels that are not
-    finite; ConfigError if ``width`` is odd or less than 6.
+    finite.
     """
-    whole = width is None or (isinstance(width, Integral) and 6 <= width <= MAX_SIDE and width % 2 == 0)
-    if not whole:
-        raise ConfigError(f"width of the environment map must be even, from 6 to {MAX_SIDE}, got {width!r}")
     # ---- Read
     if isinstance(path, np.ndarray):
         image, info = _of_array(path, name, space)

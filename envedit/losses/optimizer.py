@@ -18,7 +18,6 @@ from collections.abc import Mapping
 import drjit as dr
 import numpy as np
 
-from envedit.core.errors import InputError
 from envedit.core.types import Arrays, Params, Tensor
 
 # ---- Adam --------------------------------------------------------------------------------------------------
@@ -126,21 +125,12 @@ class Adam:
         return ("params", self.params), ("before", self._before), ("m", self._m), ("v", self._v)
 
     def load_state_dict(self, state: Mapping[str, np.ndarray]) -> None:
-        """Continue exactly where `state_dict` was taken; InputError for a state of other parameters."""
-        entries = dict(state)
-        expected = self.state_dict()
-        if entries.keys() != expected.keys():
-            odd = sorted(entries.keys() ^ expected.keys())
-            raise InputError(f"optimiser state: its entries and the parameters differ in {', '.join(odd)}.")
-        for key, value in expected.items():
-            got, shape = np.shape(entries[key]), np.shape(value)
-            if got != shape:
-                raise InputError(f"optimiser state: {key} has shape {got}, expected {shape}.")
+        """Continue exactly where `state_dict` of the same parameters was taken."""
         for name, value in self.params.items():
             for part, target in self._parts():
-                flat = dr.array_t(self._kind)(np.ascontiguousarray(entries[f"{part}/{name}"]).ravel())
+                flat = dr.array_t(self._kind)(np.ascontiguousarray(state[f"{part}/{name}"]).ravel())
                 target[name] = dr.opaque(self._kind(flat, value.shape))
-        self.t = int(entries["step"])
+        self.t = int(state["step"])
 
 
 # ---- Schedules: functions of the step, counted from 0 ------------------------------------------------------

@@ -11,13 +11,12 @@ from __future__ import annotations
 
 import math
 import os
-import tomllib
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from envedit.config.toml import quote
+from envedit.config.toml import parsed, quote
 from envedit.config.validators import Check, Number, Numbers, named
 from envedit.core import atomic_files, latlong
 from envedit.core.color import LUMINANCE
@@ -257,10 +256,7 @@ def read(path: FilePath) -> Look:
 
 def parse(text: str, path: str) -> Look:
     """Read a look from the text of a file; ConfigError as of :func:`read`."""
-    try:
-        table = tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
-        raise ConfigError(f"{path}: not TOML: {error}") from None
+    table = parsed(text, path)
     lights = {role: table.pop(role) for role in ROLES if role in table}
     values = _numbers(path, "", table, _NUMBERS)
     if lights and "key" not in lights:

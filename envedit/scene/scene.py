@@ -275,7 +275,7 @@ def load(
         raise ConfigError(f"variant: got {mi.variant()}, expected one that ends in _rgb, such as llvm_ad_rgb")
 
     # ---- Parse
-    width, height = _whole("width", width or 0, 0), _whole("height", height or 0, 0)
+    width, height = width or 0, height or 0
     parsed = _parsed(file, parameters, base)
     state, where, folders = parsed.state, parsed.where, parsed.folders
 

@@ -7,7 +7,6 @@ import functools
 import hashlib
 import json
 import os
-import tomllib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +14,7 @@ from pathlib import Path
 import envedit
 from envedit import config
 from envedit.config import presets
+from envedit.config.toml import parsed
 from envedit.core import atomic_files
 from envedit.core.errors import ConfigError
 from envedit.core.types import FilePath
@@ -108,11 +108,7 @@ def read_jobs(path: FilePath) -> list[Job]:
         if not (files := sorted(path.glob("*.toml"))):
             raise ConfigError(f"{path}: no configuration NAME.toml in this folder")
         return [job(file.stem, _text(file), path) for file in files]
-    text = _text(path)
-    try:
-        tables = tomllib.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise ConfigError(f"{path}: not TOML: {error}") from None
+    tables = parsed(_text(path), str(path))
     common = tables.pop("common", {})
     jobs = tables.pop("jobs", {})
     if tables:

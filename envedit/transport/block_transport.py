@@ -11,7 +11,6 @@ from __future__ import annotations
 import numpy as np
 
 from envedit.core import latlong
-from envedit.core.array_cache import holds
 from envedit.core.types import Views
 from envedit.transport.sparse_matrix import ColourMatrix
 
@@ -58,10 +57,6 @@ class Overview:
         count = np.bincount(self.block_of, minlength=self.blocks)[:, None]
         sums = [np.bincount(key, w, self.blocks * self.cells) for w in weights.T]
         return np.stack([one.reshape(self.blocks, self.cells) / count for one in sums]).astype(np.float32)
-
-    def fits(self, arrays: dict[str, np.ndarray]) -> bool:
-        """Return whether arrays from disk are a :attr:`matrix` of these blocks and cells."""
-        return holds(arrays, {"matrix": ("f4", (3, self.blocks, self.cells))})
 
     def to_blocks(self, picture: np.ndarray) -> np.ndarray:
         """Average a picture (h, w, c) over blocks: (blocks, c)."""

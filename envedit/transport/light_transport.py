@@ -1,27 +1,20 @@
 """Light transport T: a rendering is linear in the environment map, I = T E + I_0.
 
-T is traced once for a scene, its camera and a texel grid, without looking at any map; then rendering is a
-matrix product and its adjoint is exact. Nothing changes from step to step, so that the objective has no Monte
-Carlo noise (see docs/light_transport.md).
+T is traced once for a scene, its camera and a texel grid, without looking at any map. Of its two tiers
+(docs/light_transport.md) the coarse one (``recording.py``) renders the smooth part of a map with little
+error, but a single bright texel is hit by few samples; :meth:`LightTransport.resolved` adds columns of the
+exact one (``exact_columns.py``) for the texels that are bright in a given map:
 
-Two tiers, both unbiased for paths up to the path depth:
+    T E = T_coarse (E outside the columns) + T_exact (E inside them)
 
-* the **coarse** tier is a sparse matrix of recorded samples (``recording.py``), spread evenly over
-  directions; it renders the smooth part of a map with little error, but a single bright texel is hit by few
-  samples;
-* the **exact** tier holds columns of T (``exact_columns.py``), one ray per path vertex to that very texel.
-  :meth:`LightTransport.resolved` adds them for the texels that are bright in a given map.
-
-T E = T_coarse (E outside the columns) + T_exact (E inside them). What it costs follows the light, not the
-grid. A transport is a value: what it renders depends on the map alone. Others that differ in their columns
-share its recording and the columns in memory, which are traced when they are used first.
+A transport is a value: what it renders depends on the map alone. Others that differ in their columns share
+its recording and the columns in memory, which are traced when they are used first.
 """
 
 from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
-from numbers import Integral
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -31,10 +24,11 @@ import mitsuba as mi
 import numpy as np
 
 from envedit import config
+from envedit.config.validators import MOST_DIM, Integer, named
 from envedit.core import latlong, seeds
-from envedit.core.array_cache import DiskCache, holds, under
+from envedit.core.array_cache import DiskCache, under
 from envedit.core.arrays import tensor
-from envedit.core.errors import ConfigError, InputError, counted
+from envedit.core.errors import InputError, counted
 from envedit.core.radiance import require_radiance, require_unmasked
 from envedit.core.types import ArrayLike, Progress
 from envedit.scene import built_scene
@@ -165,8 +159,8 @@ class LightTransport:
         Raises
         ------
         ConfigError
-            ``spp`` or ``max_depth`` is below 1, the grid or ``seed`` is no whole number, ``memory_gb`` is no
-            number, or the scene's parameters or sensors cannot be used.
+            An argument is of another type or out of its range, or the scene's parameters or sensors cannot
+            be used.
         InputError
             The scene cannot be loaded, no pixel receives light from the environment, T does not fit into
             ``memory_gb``, or the grid is smaller than Mitsuba takes.
@@ -180,18 +174,12 @@ class LightTransport:
         if mi.variant() is None:
             mi.set_variant("llvm_ad_rgb")
         scene = built_scene.load(scene, config.Scene())
-        for side, texels in (("height", height), ("width", width)):
-            if not _whole(texels, 1):
-                raise ConfigError(f"{side}: got {texels!r}, expected a whole number of texels")
+        height, width = (
+            named(side, Integer(1, MOST_DIM), n) for side, n in (("height", height), ("width", width))
+        )
         latlong.check_envmap_size(height, width)
-        if not _whole(seed, 0):
-            raise ConfigError(f"seed: got {seed!r}, expected a whole number of at least 0")
-        memory_gb = sampling_plan.allowed(memory_gb)
-        for name, value in (("spp", spp), ("max_depth", max_depth)):
-            if value != "auto" and not _whole(value, 1):
-                raise ConfigError(
-                    f"renderer.{name}: got {value!r}, expected a whole number of at least 1, or auto"
-                )
+        renderer = config.Renderer(spp=spp, max_depth=max_depth, memory_gb=memory_gb)
+        config.Config(seed=seed)  # checks it
 
         # ---- How T is sampled, by a few paths under a white sky
         cache = DiskCache(None if folder is None else Path(folder))
@@ -203,13 +191,14 @@ class LightTransport:
         }
         grid = height, width
         light = sampling_plan.white_sky(cache, origin | {"part": "pilot"}, scene, grid, seed)
-        plan = sampling_plan.choose(scene, grid, light, spp, max_depth, memory_gb, few)
+        allowed = sampling_plan.allowed(renderer.memory_gb)
+        plan = sampling_plan.choose(scene, grid, light, renderer.spp, renderer.max_depth, allowed, few)
         transport = cls(scene, Grid(height, width, scene.to_world, plan.mass), plan, seed)
 
         # ---- The recording, from disk or traced
         key = origin | {"part": "recording"} | plan.key()
         transport._stored = cache, key | {"part": "overview"}
-        recording = cache.load(key, transport._whole)
+        recording = cache.load(key)
         if recording is None:
             offset = other_light(scene, plan.lamps, seed)
             offset = np.zeros(1, np.float32) if offset is None else offset.ravel()
@@ -253,19 +242,6 @@ class LightTransport:
             "offset": self._offset.numpy(),
             **{f"{part}/{name}": array for part, arrays in parts.items() for name, array in arrays.items()},
         }
-
-    def _whole(self, arrays):
-        """Return whether :meth:`_take` can take arrays from disk."""
-        pixels = self.shape[0] * self.shape[1]
-        own = {k: a for k, a in arrays.items() if "/" not in k}
-        kept = {"influence": ("f4", self.grid.shape), "lost": ("i8", ()), "offset": ("f4", (None,))}
-        shapes = {"forward": (pixels, self.grid.texels), "reverse": (self.grid.texels, pixels)}
-        return (
-            holds(own, kept)
-            and own["offset"].size in (1, 3 * pixels)
-            and own["lost"] >= 0
-            and all(ColourMatrix.whole(under(arrays, f"{part}/"), shape) for part, shape in shapes.items())
-        )
 
     def _take(self, arrays):
         """Take the first recording from arrays."""
@@ -328,7 +304,7 @@ class LightTransport:
         if self._overview is None:
             cache, key = self._stored
             overview = Overview(self.shape, self.grid.shape, self.scene.rows)
-            stored = cache.load(key, overview.fits)
+            stored = cache.load(key)
             if stored is None:
                 stored = {"matrix": overview.summed(self.forward)}
                 cache.store(key, stored)
@@ -570,11 +546,6 @@ class LightTransport:
         tolerance = self.tolerance if tolerance is None else tolerance
         radiance, omega = self._radiance(envmap)
         return bright_texels.brightest(radiance, omega, self._samples, tolerance)
-
-
-def _whole(value, least):
-    """Return whether a value is a whole number that is not less than ``least``."""
-    return isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= least
 
 
 def _within(numbers, least, most):

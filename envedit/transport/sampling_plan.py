@@ -13,8 +13,8 @@ import drjit as dr
 import numpy as np
 
 from envedit.core import latlong, seeds
-from envedit.core.array_cache import DiskCache, holds
-from envedit.core.errors import ConfigError, InputError
+from envedit.core.array_cache import DiskCache
+from envedit.core.errors import InputError
 from envedit.scene.scene import Scene
 from envedit.transport import recording
 from envedit.transport.sparse_matrix import SLICE
@@ -100,13 +100,7 @@ def white_sky(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Measure the light by row of a map (H, W) and by bounce, or take it from disk; see :func:`pilot`."""
     height, width = shape
-    known = {"by_row": ("f8", (height,)), "by_bounce": ("f8", (None,))}
-    light = cache.load(
-        key,
-        lambda arrays: (
-            holds(arrays, known) and len(arrays["by_bounce"]) > MAX_BOUNCES and arrays["by_bounce"].sum() > 0
-        ),
-    )
+    light = cache.load(key)
     if light is None:
         sphere = latlong.solid_angles(height, width)
         by_row, by_bounce = pilot(scene, Grid(height, width, scene.to_world, sphere), seed)
@@ -222,12 +216,8 @@ def choose_samples(scene: Scene, spp: int | str, texels: int, memory_gb: float) 
 
 
 def allowed(memory_gb: float | str) -> float:
-    """Return the GB that a setting allows; ConfigError if it is no number."""
-    if memory_gb == "auto":
-        return AUTO_GB
-    if isinstance(memory_gb, str):
-        raise ConfigError(f"renderer.memory_gb: got {memory_gb!r}, expected a number, or auto")
-    return float(memory_gb)
+    """Return the GB that a setting allows."""
+    return AUTO_GB if isinstance(memory_gb, str) else memory_gb
 
 
 def most_samples(pixels: int, memory_gb: float) -> int:

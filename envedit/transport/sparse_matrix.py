@@ -13,8 +13,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from envedit.core.array_cache import holds
-
 SLICE = 8
 
 
@@ -67,37 +65,6 @@ class ColourMatrix:
             "entries": np.array(self.entries, np.int64),
             **{name: getattr(self, f"_{name}").numpy() for name in ("packed", "start", "stop", "lane")},
         }
-
-    @staticmethod
-    def whole(arrays: dict[str, np.ndarray], shape: tuple[int, int]) -> bool:
-        """Return whether :meth:`from_arrays` takes arrays as a matrix of this shape: no index leaves it."""
-        lanes = -(-shape[0] // SLICE) * SLICE
-        numbers = {"shape": ("i8", (2,)), "entries": ("i8", ())}
-        places = {"start": ("u4", (lanes,)), "stop": ("u4", (lanes,)), "lane": ("u4", (shape[0],))}
-        some = {name: array for name, array in arrays.items() if name != "packed"}
-        packed = arrays["packed"]
-        if not holds(some, numbers | places) or packed.dtype != np.float32 or packed.ndim != 1:
-            return False
-        start, stop = (arrays[name].astype(np.int64) for name in ("start", "stop"))
-        count, rest = divmod(len(packed), 4)
-        if (
-            rest
-            or not count
-            or tuple(arrays["shape"].tolist()) != shape
-            or not 0 <= arrays["entries"] <= count
-        ):
-            return False
-        # As integers: of floats that are not negative the largest is the largest, infinity above them all.
-        largest = _largest(packed.view(np.uint32))
-        finite = largest[:3].max() < 0x7F800000 or np.isfinite(packed.reshape(-1, 4)[:, :3]).all()
-        return bool(
-            finite
-            and largest[3] < shape[1]
-            and (arrays["lane"] < lanes).all()
-            and (stop >= start).all()
-            and ((stop - start) % SLICE == 0).all()
-            and (stop[stop > start] - SLICE < count).all()
-        )
 
     @classmethod
     def from_arrays(cls, arrays: dict[str, np.ndarray]) -> ColourMatrix:
@@ -152,14 +119,6 @@ class ColourMatrix:
         products = _product(self._packed, x, self._start, self._stop, count)
         dr.eval(products)
         return [dr.gather(mi.Color3f, product, self._lane) for product in products]
-
-
-def _largest(values):
-    """Return the largest of every fourth value, (4,): rows of 1024 go at the speed of memory."""
-    whole = len(values) // 1024 * 1024
-    parts = values[:whole].reshape(-1, 1024), values[whole:].reshape(-1, 4)
-    maxima = [part.max(axis=0).reshape(-1, 4).max(axis=0) for part in parts if len(part)]
-    return np.max(maxima, axis=0)
 
 
 @dr.syntax

@@ -43,10 +43,9 @@ def measure(
     dict
         ``transport``: a row with what was traced (``spp``, ``depth``, ``columns``, ``choices``), seconds
         (``first_s``, ``again_s`` of tracing, ``resolve_s``, ``load_s`` from disk), bytes (``held``, and
-        ``read`` by both products), ``floor_s``: the seconds that reading these once takes; seconds of the
-        products, and of a step, a rendering and its gradient: through T with its share of looking for texels
-        grown bright, and by path tracing with the map set as an edit has to (Mitsuba builds its sampling
-        table anew). Under a sun also :func:`compared`.
+        ``read`` by both products); seconds of the products, and of a step, a rendering and its gradient:
+        through T with its share of looking for texels grown bright, and by path tracing with the map set as
+        an edit has to (Mitsuba builds its sampling table anew). Under a sun also :func:`compared`.
         ``quality-parts``: :func:`without_caustics` of a scene with a mirror, under a sun.
     """
     # ---- tracing -----------------------------------------------------------------------------------------
@@ -101,7 +100,6 @@ def measure(
         "held": transport.memory_bytes,
         "read": read,
         "bandwidth": bandwidth,
-        "floor_s": floor,
         "above_floor": (median["apply"] + median["adjoint"]) / floor if floor else None,
         "apply_s": median["apply"],
         "adjoint_s": median["adjoint"],
@@ -146,7 +144,7 @@ def build(lit, height: int, width: int, renderer, folder: Path | None = None):
     return built, time.perf_counter() - start
 
 
-def from_disk(lit, height: int, width: int, renderer, repeats: int = 3) -> float | None:
+def from_disk(lit, height: int, width: int, renderer) -> float | None:
     """Return the median seconds in which T comes from its file, which the system still has in memory.
 
     None if T was not kept.
@@ -154,7 +152,7 @@ def from_disk(lit, height: int, width: int, renderer, repeats: int = 3) -> float
     with tempfile.TemporaryDirectory() as folder:
         build(lit, height, width, renderer, Path(folder))
         taken = []
-        for _ in range(repeats):
+        for _ in range(3):
             gc.collect()
             built, seconds = build(lit, height, width, renderer, Path(folder))
             if not built.cached:

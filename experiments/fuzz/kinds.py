@@ -15,7 +15,6 @@ import mitsuba as mi
 import numpy as np
 
 from envedit import config
-from envedit.core import array_cache
 from envedit.core.errors import EnveditError
 from envedit.images import images
 from envedit.losses.perceptual import weights
@@ -171,36 +170,21 @@ damaged_configuration = partial(damage.of_text, grammar=TOML)
 damaged_scene = partial(damage.of_text, grammar=XML)
 
 
-def _arrays(data: bytes) -> dict[str, np.ndarray]:
-    with np.load(io.BytesIO(data)) as stored:
-        return dict(stored)
-
-
-def _archive(arrays: dict[str, np.ndarray]) -> bytes:
-    stream = io.BytesIO()
-    np.savez(stream, **arrays)
-    return stream.getvalue()
-
-
-def damaged_entry(data: bytes, rng: np.random.Generator) -> bytes:
-    """Change the arrays of a cache entry, under right checksums."""
-    arrays = _arrays(data)
-    key = arrays.pop(array_cache.KEY)
-    return _archive({array_cache.KEY: key} | damage.of_arrays(arrays, rng))
-
-
 def damaged_checkpoint(data: bytes, rng: np.random.Generator) -> bytes:
     """Damage the bytes, or the arrays and the state of a checkpoint under right checksums."""
     if rng.random() < 0.5:
         return damage.of_bytes(data, rng)
-    arrays = _arrays(data)
+    with np.load(io.BytesIO(data)) as stored:
+        arrays = dict(stored)
     meta = json.loads(arrays.pop("meta").tobytes())
     if rng.random() < 0.3:
         values = (-1, 2**70, "2", None, [], {}, 0.5, 1e400, True, [5], [{}])
         meta["state"][str(rng.choice(list(meta["state"])))] = damage.one_of(values, rng)
     else:
         arrays = damage.of_arrays(arrays, rng)
-    return _archive({"meta": np.frombuffer(json.dumps(meta).encode(), np.uint8)} | arrays)
+    stream = io.BytesIO()
+    np.savez(stream, meta=np.frombuffer(json.dumps(meta).encode(), np.uint8), **arrays)
+    return stream.getvalue()
 
 
 # ---- kinds -------------------------------------------------------------------------------------------------
@@ -225,7 +209,7 @@ KINDS = {
     "weights": Kind(partial(whole.stored, "weights"), read_weights),
     "scene": Kind(partial(whole.stored, "scene"), read_scene, damaged_scene),
     "asset": Kind(partial(whole.stored, "asset"), read_asset, one_in=10),
-    "entry": Kind(lambda: {"recording.arrays": whole.recording().read_bytes()}, read_entry, damaged_entry),
+    "entry": Kind(lambda: {"recording.arrays": whole.recording().read_bytes()}, read_entry),
     "checkpoint": Kind(whole.checkpoint_files, read_checkpoint, damaged_checkpoint),
 }
 

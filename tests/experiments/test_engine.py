@@ -10,10 +10,8 @@ from experiments.summary import values
 from tests.oracles import ROOT
 
 KERNELS = {"kernels": {"calls": 5, "launched": 10, "compiled": 0}}
-SIREN = KERNELS | {"step": {"median_s": 2.0}, "forward": {"min_s": 1.0}}
-TRANSPORT = KERNELS | {"adjointness": 1e-7, "columns": 1, "read": 1, "floor_s": 1e-3, "load_s": 0.1}
+TRANSPORT = KERNELS | {"adjointness": 1e-7, "columns": 1, "load_s": 0.1}
 QUALITY = {"quick": True, "prb_rmse": 0.1, "rmse": 0.02, "corrected": 0.02, "noise": 0.01}
-FITS = {"noisy_worst": 30.0, "noisy_mean": 31.0, "log_psnr": 40.0}
 
 
 def rows(table, row):
@@ -28,20 +26,15 @@ def test_there_is_a_table_for_every_marker_of_the_page():
 
 
 @pytest.mark.parametrize(("table", "row", "changes", "says"), [
-    ("bandwidth", {"rate": 1.0}, {"rate": 0.0}, "a rate of 0.0"),
-    ("rays", {"rate": 1.0}, {"rate": 0.0}, "a rate of 0.0"),
-    ("siren", SIREN, {"step": {"median_s": 0.5}}, "takes no time"),
-    ("siren", SIREN, {"kernels": {"calls": 5, "launched": 4, "compiled": 0}}, "only 4 kernels"),
-    ("transport", TRANSPORT, {"kernels": SIREN["kernels"] | {"compiled": 1}}, "1 of 10"),
+    ("siren", KERNELS, {"kernels": {"calls": 5, "launched": 4, "compiled": 0}}, "only 4 kernels"),
+    ("transport", TRANSPORT, {"kernels": KERNELS["kernels"] | {"compiled": 1}}, "1 of 10"),
     ("transport", TRANSPORT, {"adjointness": 1e-4}, "adjoint off by 0.0001"),
     ("transport", TRANSPORT, {"columns": 0}, "no exact column"),
-    ("transport", TRANSPORT, {"floor_s": 0.0}, "nothing is read"),
     ("transport", TRANSPORT, {"load_s": None}, "not found on disk"),
     ("quality", QUALITY, {"prb_rmse": 0.01}, "better than T"),
     ("quality", QUALITY, {"corrected": 0.06}, "T's picture is off by 6.0 %"),
     ("quality", QUALITY, {"noise": 0.06}, "the reference is off by 6.0 %"),
-    ("fits", FITS, {"noisy_mean": 42.0}, "noise makes the fit better"),
-    ("fits", FITS, {"not_finite": ["fits[0].peak"]}, "fits[0].peak is not finite"),
+    ("fits", {}, {"not_finite": ["fits[0].peak"]}, "fits[0].peak is not finite"),
 ])  # fmt: skip
 def test_what_does_not_hold_is_named(table, row, changes, says):
     assert tables.failures(rows(table, row)) == []

@@ -4,11 +4,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from envedit.core.errors import InputError
 from envedit.losses.optimizer import Adam, cosine, cosine_warm_restarts, ramp
 from tests.oracles import ROOT
 from tests.oracles.kernels import own
-from tests.oracles.matrix_renderer import same
 
 # By experiments/references/make_adam_reference.py of commit 78ead632, PyTorch 2.13.0.
 REFERENCE = ROOT / "tests" / "data" / "adam_reference.npz"
@@ -46,19 +44,6 @@ def test_the_given_array_is_left_alone(rng):
     np.testing.assert_array_equal(start, kept)
     start[:] = 7
     np.testing.assert_array_equal(np.array(adam.params["p"]), start_moved)
-
-
-def test_a_state_of_other_parameters_is_refused():
-    x = own([1.0, 2.0])
-    adam = Adam({"x": x}, lr=1)
-    with pytest.raises(
-        InputError, match="entries and the parameters differ in before/x, m/x, params/x, step"
-    ):
-        adam.load_state_dict({})
-    state = adam.state_dict()
-    with pytest.raises(InputError, match=r"m/x has shape \(3,\), expected \(2,\)"):
-        adam.load_state_dict(state | {"m/x": np.zeros(3)})
-    assert same(adam.state_dict(), state)
 
 
 # ---- Schedules --------------------------------------------------------------------------------------------

@@ -14,7 +14,7 @@ import pytest
 
 from envedit.core.errors import InputError
 from envedit.losses.perceptual import convolution, installed
-from envedit.losses.perceptual.backbones import KINDS, Backbone
+from envedit.losses.perceptual.backbones import KINDS, Backbone, Stack
 from envedit.losses.perceptual.distances import Dists, Lpips
 from tests.oracles import ROOT
 from tests.oracles.plain import double, gradient, single
@@ -68,13 +68,13 @@ def lpips(backbones, folder):
 )
 def test_features_in_bands_are_the_same(kind, pooling, size, backbones, monkeypatch, rng):
     """Taps in double precision, and the gradient of the sum of taps times directions."""
-    stack = backbones[kind].stack(*size, pooling)
+    stack = Stack(backbones[kind], *size, pooling)
     x = double(rng.normal(size=(*size, 3))).array
     directions = [mi.Float64(rng.normal(size=n * c)) for _, n, c in stack.taps(stack.forward(x))]
 
     def found(most):
         monkeypatch.setattr(convolution, "MOST_PATCHES", most)
-        stack = backbones[kind].stack(*size, pooling)
+        stack = Stack(backbones[kind], *size, pooling)
         tape = stack.forward(x)
         back = [stack.backward(tape, directions)] if pooling == "hanning" else []
         return [np.array(one) for one in (*(tap for tap, _, _ in stack.taps(tape)), *back)]
@@ -96,7 +96,7 @@ def test_max_pooling_does_not_lose_nan():
 def test_least_sizes(backbones):
     """torchvision says 32 and 63, which counts the last pooling."""
     for kind, n in (("vgg", 16), ("alex", 31)):
-        stack = backbones[kind].stack(n, n)
+        stack = Stack(backbones[kind], n, n)
         last, pixels, _ = stack.taps(stack.forward(dr.ones(mi.Float, n * n * 3)))[-1]
         assert pixels >= 1 and np.isfinite(last).all()
         assert backbones[kind].least_size == n
@@ -148,7 +148,7 @@ def test_trained_networks_score_as_the_authors_programs(data):
     pairs = list(drawn.pairs())
     assert drawn.checksum(image for pair in pairs for image in pair) == images
     vgg, heads = Backbone.load("vgg", folder / installed.VGG), str(folder / installed.HEADS)
-    alex = Lpips("alex", folder / installed.BACKBONES["alex"], heads.format("alex"))
+    alex = Lpips("alex", Backbone.load("alex", folder / installed.BACKBONES["alex"]), heads.format("alex"))
     dists = Dists(vgg, folder / installed.DISTS)
     measures = alex, Lpips("vgg", vgg, heads.format("vgg")), lambda a, b: dists.against(b)(a)
     found = [[np.ravel(measure(single(x), single(y)))[0] for measure in measures] for x, y in pairs]
@@ -199,7 +199,7 @@ def test_pixels_without_any_feature(folder):
     backbone = Backbone("alex", state)
     x, y = np.tile([0.485, 0.456, 0.406], (40, 40, 1)), drawn.images(40, 40)[0]
     lpips = Lpips("alex", backbone, folder / "alex.npz")
-    stack = backbone.stack(40, 40)
+    stack = Stack(backbone, 40, 40)
     normal = ((x - [0.485, 0.456, 0.406]) / 0.229).astype(np.float32)
     assert not any(np.any(tap) for tap, _, _ in stack.taps(stack.forward(mi.Float(normal.ravel()))))
     assert lpips.distance(double(x), double(y))[0] > 0.1
@@ -238,7 +238,7 @@ def test_a_backbone_is_loaded_from_a_file(backbones, folder):
     np.savez(folder / "alexnet.npz", **state)
     x, y, _ = drawn.images(40, 40)
     expected = Lpips("alex", backbones["alex"], folder / "alex.npz")(x, y)
-    assert Lpips("alex", folder / "alexnet.npz", folder / "alex.npz")(x, y) == expected
+    assert Lpips("alex", Backbone.load("alex", folder / "alexnet.npz"), folder / "alex.npz")(x, y) == expected
     with pytest.raises(InputError, match=r"'features.0.weight' has the shape \(64, 3, 3, 3\), in AlexNet"):
         np.savez(folder / "mixed.npz", **(state_of("alex") | {"features.0.weight": np.zeros((64, 3, 3, 3))}))
         Backbone.load("alex", folder / "mixed.npz")

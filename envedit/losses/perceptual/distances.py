@@ -18,7 +18,7 @@ from envedit.core.arrays import tensor
 from envedit.core.errors import InputError
 from envedit.core.types import DrArray, FilePath, Shape, Tensor
 from envedit.losses.perceptual import weights
-from envedit.losses.perceptual.backbones import Backbone
+from envedit.losses.perceptual.backbones import Backbone, Stack
 from envedit.losses.perceptual.convolution import Divisor
 from envedit.losses.ssim import KnownGradient
 
@@ -98,7 +98,8 @@ class _DistsTo:
     """The distance to a fixed image: value, and gradient by hand."""
 
     def __init__(self, dists, reference):
-        self._stack = dists.backbone.stack(reference.shape[0], reference.shape[1], "hanning")
+        height, width, _ = reference.shape
+        self._stack = Stack(dists.backbone, height, width, "hanning")
         self._weights = dists.weights
         self._reference = []
         for y, channels in self._features(dr.detach(reference.array))[0]:
@@ -173,13 +174,13 @@ class Lpips:
     the authors' PyTorch code with ``normalize=True``: features of every tapped layer, divided by their length
     at each pixel; squared differences, weighted by channel, averaged over pixels, summed over layers.
 
-    ``kind`` is "alex" or "vgg", ``backbone`` the network or its file (`Backbone.load`), the heads' file an
+    ``kind`` is "alex" or "vgg", ``backbone`` the network, the heads' file an
     ``npz`` with ``lin0.model.1.weight`` (1, C, 1, 1) and so on, one for every layer; errors as of
     :func:`.weights.read`.
     """
 
-    def __init__(self, kind: str, backbone: FilePath | Backbone, heads_file: FilePath):
-        self.backbone = backbone if isinstance(backbone, Backbone) else Backbone.load(kind, backbone)
+    def __init__(self, kind: str, backbone: Backbone, heads_file: FilePath):
+        self.backbone = backbone
         shapes: dict[str, Shape] = {
             f"lin{i}.model.1.weight": (1, c, 1, 1) for i, c in enumerate(self.backbone.channels)
         }
@@ -192,7 +193,7 @@ class Lpips:
 
     def distance(self, a: Tensor, b: Tensor) -> DrArray:
         """Return the distance of two images ``(H, W, 3)`` in their precision, as a size-1 array."""
-        stack = self.backbone.stack(a.shape[0], a.shape[1], "max")
+        stack = Stack(self.backbone, *a.shape[:2])
         features = [stack.taps(stack.forward(_normalised(image.array))) for image in (a, b)]
         score = mi.Float64(0)
         for (x, pixels, channels), (y, _, _), head in zip(*features, self.heads, strict=True):

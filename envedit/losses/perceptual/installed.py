@@ -84,7 +84,8 @@ def load(settings: config.Config) -> Networks:
     if "vgg" in paths:
         dists = distances.Dists(backbones.Backbone.load("vgg", paths["vgg"]), paths["dists"])
     if "backbone" in paths:
-        lpips = distances.Lpips(chosen.perceptual.network, paths["backbone"], paths["heads"])
+        kind = chosen.perceptual.network
+        lpips = distances.Lpips(kind, backbones.Backbone.load(kind, paths["backbone"]), paths["heads"])
     return Networks(chosen, dists, lpips, missing(settings))
 
 

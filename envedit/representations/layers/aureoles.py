@@ -1,15 +1,12 @@
 """The glow of a light, wherever the light is placed and however bright it is made.
 
 A glow G is measured as a factor of the sky around a light (``separation.py``). Of a light at direction d,
-with s times its flux, it is f(s) c(d) G:
-
-    f(s) = 2 s / (1 + s),    c(d) = min(1, M(d_0) / M(d)),    M(d) = sum of G Y(B) over sum of G,
-
-where d_0 is where the light was, Y(B) the luminance of the background and the sums go over the texels around
-d. A glow is light of the sun that air has scattered. Before bright clouds or at a bright horizon it is
-therefore no brighter in itself, c. It is gone with its light, but of a brighter sun it is hardly brighter:
-on eight PureSky maps, whose suns have 0.06 to 25 times the irradiance of their skies, the glow at 10 degrees
-goes with the flux to the power of 0.12 (``python -m experiments natural.aureoles run``).
+with s times its flux, it is f(s) c(d) G, with f(s) = 2 s / (1 + s) and c(d) = min(1, M(d_0) / M(d)): d_0 is
+where the light was, M(d) the mean luminance of the background under G around d. A glow is light of the sun
+that air has scattered. Before bright clouds or at a bright horizon it is therefore no brighter in itself, c.
+It is gone with its light, but of a brighter sun it is hardly brighter: on eight PureSky maps, whose suns have
+0.06 to 25 times the irradiance of their skies, the glow at 10 degrees goes with the flux to the power of 0.12
+(``python -m experiments natural.aureoles run``).
 """
 
 from __future__ import annotations

@@ -1,18 +1,11 @@
 """What is seen where the glow of a light has gone: the sky of the same elevation.
 
 Dividing a map by a glow leaves what the glow was not: its own asymmetry, a tint, and clouds whose contrast
-was measured beside a light. With B the background, b = log B, K a Gaussian on the sphere and l = K b, what is
-seen there instead is
-
-    log R = m + c (b - l),    m = mean of l at the same elevation,
-    c = k min(1, sqrt(m(v) / K v)),    v = (b - l)^2
-
-the texture stays, at no more than the contrast that it has at this elevation, but for that within K of a
-light's core, where k is 0: it is bloom and no cloud. Level and colour are those of the elevation. Means are
-weighted by 1 / glow^2, and by less where it is darker than they are: they describe the sky away from the
-lights, and no roofs or trees. A texel goes from B to R by w, the share of its radiance that was the glow's
-and is gone, E = B G exp(w (log R - b)) with w = max(1 - G / G_0, 0): a light that has not moved changes
-nothing, and there is no edge.
+was measured beside a light. What is seen there instead (r, c and w of docs/method.md, "Where the sun was")
+keeps the texture, at no more than the contrast that it has at this elevation; within a blur of a light's core
+it is bloom and no cloud. Level and colour are those of the elevation. Means are weighted by 1 / glow^2, and
+by less where it is darker than they are: they describe the sky away from the lights, and no roofs or trees. A
+light that has not moved changes nothing, and there is no edge.
 """
 
 from __future__ import annotations
@@ -26,15 +19,15 @@ from envedit.core.color import LUMINANCE
 from envedit.representations.layers.separation import Light, away_weight, mean_at_elevation, sky_weight
 
 BLUR_DEGREES = 4.0
-"""Standard deviation of K: what is finer is texture, what is coarser the sky's brightness. Measured: with 2
-and 8 degrees maps whose lights have moved are 0.05 dB better and 0.13 dB worse."""
+"""Standard deviation of the blur: what is finer is texture, what is coarser the sky's brightness. Measured:
+with 2 and 8 degrees maps whose lights have moved are 0.05 dB better and 0.13 dB worse."""
 LEAST_VARIANCE = 1e-12
 """Variance of log luminance that is added before a quotient of two: keeps it finite. Not measured."""
 
 
 @dataclass(frozen=True)
 class BehindGlow:
-    """log R - b = offset + slope log(B + faint), which holds at any resolution of B."""
+    """r = offset + slope log(B + faint), which holds at any resolution of the background B."""
 
     # offset, slope: (rows, W, 3), smooth; slope is c - 1
     offset: np.ndarray
@@ -42,7 +35,7 @@ class BehindGlow:
     faint: float  # added before logarithms, 1e-6 of the mean radiance
 
     def log_change(self, background: np.ndarray) -> np.ndarray:
-        """Return log R - b of a background (rows, W, 3)."""
+        """Return r of a background (rows, W, 3)."""
         return self.offset + self.slope * np.log(background + self.faint)
 
 

@@ -43,7 +43,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _run(arguments, console):
-    overrides = [f"input.envmap={config.quote(arguments.map)}", *arguments.overrides]
+    overrides = [*arguments.overrides, f"input.envmap={config.quote(arguments.map)}"]
     settings = config.loads("", Path.cwd(), "command line", arguments.preset, overrides)
     doctor.select(settings.variant)
     from envedit import inputs

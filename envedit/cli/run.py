@@ -204,7 +204,6 @@ def _export_initial(settings, base, file, console):
         input_map = inputs.read_map(settings.input, scene, settings.input.width)
         notes = inputs.notes(settings.input, scene, input_map)
         warnings = input_map.warnings
-        settings = replace(settings, input=replace(settings.input, envmap=input_map.source))
         picture = initial_rendering.initial(scene, input_map.radiance, settings)
         tonemap = initial_rendering.export_tonemap(file, picture, settings)
         for view_file, rows in files:

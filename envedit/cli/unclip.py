@@ -17,8 +17,8 @@ def main(argv: list[str] | None = None) -> int:
     parser = map_command.make_parser(
         "unclip",
         "Give a map whose sun was clipped its sun back: a disc of the sun's size behind the aureole, with\n"
-        "a flux estimated from aureole, sky and elevation. Where nothing is clipped, or a lamp or cloud,\n"
-        "no file is written; --flux and --ratio put a sun there all the same.",
+        "a flux estimated from aureole, sky and elevation. Where nothing is clipped no file is written; of\n"
+        "a lamp or cloud neither, but with --flux or --ratio.",
         [
             "envedit unclip sky.hdr",
             "envedit unclip panorama.jpg --out sky.exr --ratio 4",

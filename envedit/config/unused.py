@@ -26,8 +26,12 @@ def unused(config: Config, solver: str | None = None) -> list[str]:
                 continue
             if reason := _reason(config, conditions(name, key), solver):
                 found.setdefault(reason, []).append(f"{name}.{key}")
+    counting = set()
     if config.input.lights:  # they are placed by the horizon whatever the representation is
-        found = {reason: [key for key in keys if key != "input.horizon"] for reason, keys in found.items()}
+        counting.add("input.horizon")
+    if config.target.kind == "envmap" and config.target.file:  # which may be a picture of the scene
+        counting.add("target.tonemap")
+    found = {reason: [key for key in keys if key not in counting] for reason, keys in found.items()}
     if soft := _soft_gaussians(config):
         found['no effect: needs shape other than "gaussian"'] = soft
     return [f"{', '.join(keys)}: {reason}" for reason, keys in found.items() if keys]

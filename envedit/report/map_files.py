@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from envedit import config, inputs
-from envedit.core import atomic_files
+from envedit.core import atomic_files, primaries
 from envedit.core.errors import InputError
 from envedit.export import light_list
 from envedit.images import images
@@ -63,7 +63,7 @@ def write_look(folder: Path, result: results.Result) -> list[str]:
 def write_scene(folder: Path, result: results.Result) -> list[str]:
     """Write ``edited.xml``, the scene lit by the edited map, which lies beside it, and ``edited.usda``.
 
-    Returns a warning, if it cannot be written.
+    Returns a warning, if it cannot be written, or Mitsuba takes the map's colours for others.
     """
     edited = f"edited.{result.settings.output.format}"
     lights = result.lights["after"]
@@ -80,4 +80,10 @@ def write_scene(folder: Path, result: results.Result) -> list[str]:
     except InputError as error:  # the scene's files may be gone by now
         return [f"edited.xml or edited.usda is not written: {error}"]
     atomic_files.write_atomically(folder / "edited.xml", text.encode())
-    return []
+    space = result.input_map.chromaticities
+    if space is None or result.settings.output.format == "hdr":
+        return []
+    return [
+        f"edited.xml: {edited} is in {primaries.name_of(space)}, which Mitsuba takes for Rec. 709: it shows "
+        'other colours than render_edited.exr; with output.format = "hdr" it shows these'
+    ]

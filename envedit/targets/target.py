@@ -366,6 +366,10 @@ def _rendered(settings, scene, envmap, other):
         true = inputs.scaled(true, scene.own.scale, str(chosen.file))
         source = f"rendered under {chosen.file}"
         warnings = tuple(f"{info['path']}: {line}" for line in info["warnings"])
+        if other is None and any(scene.width == 2 * (rows.stop - rows.start) for rows in scene.rows):
+            line = "is 2:1, as the rendering is, and read as a map"
+            remedy = 'for a picture of the scene set target.kind = "rendering"'
+            warnings = (*warnings, f"{file}: {line}; {remedy}")
     else:
         true, warnings = latlong.rotate(envmap, chosen.degrees), ()
         source = f"rendered under the map turned by {chosen.degrees:g} degrees"

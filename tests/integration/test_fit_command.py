@@ -58,6 +58,14 @@ def test_the_map_is_not_overwritten(tmp_path, rng, capsys):
     assert (tmp_path / "fitted.exr").read_bytes() == before
 
 
+def test_the_map_of_the_command_is_fitted_whatever_set_says(tmp_path, rng, capsys):
+    images.write_exr(tmp_path / "map.exr", sky(rng))
+    assert call(tmp_path / "map.exr", tmp_path / "out") == 0
+    other = f"input.envmap={config.quote(str(tmp_path / 'none.exr'))}"
+    assert call(tmp_path / "map.exr", tmp_path / "again", other) == 0
+    assert "kept from an earlier run" in capsys.readouterr().out
+
+
 def test_a_map_that_is_not_there_is_an_error_in_one_line(tmp_path, capsys):
     assert call(tmp_path / "none.exr", tmp_path / "out") != 0
     error = capsys.readouterr().err

@@ -9,6 +9,7 @@ import pytest
 
 from envedit.core import latlong
 from envedit.core.errors import NumericalError
+from envedit.core.primaries import ACES_AP1
 from envedit.export import light_list
 from envedit.images import images
 from envedit.maps import looks
@@ -134,6 +135,19 @@ def test_radiance_files_hold_every_exponent_to_a_256th(width, tmp_path, rng):
         assert error.max() <= 1 / 255.9 and np.isfinite(found).all()
     with pytest.raises(NumericalError, match="not finite"):
         images.write_hdr(tmp_path / "b.hdr", np.full((3, 6, 3), np.nan))
+
+
+@pytest.mark.parametrize("ending", ["exr", "hdr"])
+def test_a_map_whose_colours_mitsuba_takes_for_others_is_named(ending, tmp_path, capsys):
+    """Mitsuba knows no primaries of a file; a Radiance file is written in Rec. 709."""
+    path = written(tmp_path, (users_scenes.PATH, users_scenes.SENSOR, BALL, light()))
+    images.write_exr(tmp_path / "own.exr", pixels(tmp_path / "own.exr"), chromaticities=ACES_AP1)
+    quick = changed(target__kind="none", output__exposure=1, output__spp=256, output__format=ending)
+    assert call(path, "--quiet", *quick) == 0
+    warned = "edited.xml: edited.exr is in ACEScg" in capsys.readouterr().err
+    plain = np.array(mi.render(mi.load_file(str(tmp_path / "c_out" / "edited.xml")), spp=256))[..., :3]
+    ratio = plain.mean((0, 1)) / pixels(tmp_path / "c_out" / "render_edited.exr").mean((0, 1))
+    assert warned == (ending == "exr") == (np.ptp(ratio) > 0.03)
 
 
 @pytest.mark.slow

@@ -8,6 +8,7 @@ import pytest
 
 from envedit import config
 from envedit.images import images
+from envedit.targets import initial_rendering
 from tests.oracles import users_scenes
 from tests.oracles.builders import BALL, SENSOR, sky, write_scene
 from tests.oracles.runs import TINY, call, changed, no_constant, pixels, world
@@ -56,6 +57,14 @@ def test_a_scene_and_an_option_are_an_edit(option, here, capsys):
     before = pixels(here / "scene_out" / "edited.exr")
     assert call(here / "scene_out" / "config.toml", "--quiet", "--out", "again") == 0
     assert pixels(here / "again" / "edited.exr").tobytes() == before.tobytes()
+
+
+def test_an_export_names_the_map_as_the_run_that_reads_it_does(here):
+    """Or that run would say of a picture that is painted all over that another map had made it."""
+    assert call("scene.xml", *small(), "--export-initial", "paint.exr", "--quiet") == 0
+    facts = json.loads((here / "paint.exr.envedit.json").read_text())
+    of_run = config.from_dict({"scene": {"file": "scene.xml"}})
+    assert facts["envmap"] == initial_rendering.origin(of_run, (1, 1, 3), "linear")["envmap"]
 
 
 @pytest.mark.slow

@@ -44,6 +44,15 @@ def test_one_sun_moves_on_a_great_circle_and_its_flux_changes_geometrically(amou
     np.testing.assert_allclose(mixed[far], 0.2 ** (1 - amount) * 0.8**amount, rtol=1e-3)
 
 
+@pytest.mark.parametrize("other", [20000, 0])
+def test_a_light_that_does_not_move_keeps_its_shape(other):
+    """Between a map and itself, and where it fades."""
+    first, second = sky((12, 30), 20000, 0.2), sky((12, 30) if other else None, other, 0.2)
+    expected = first * 1.0
+    expected[12, 30] = (expected[12, 30] - 0.2) * (1 if other else 0.5) + 0.2
+    np.testing.assert_allclose(blended.blend(first, second, 0.5)[0], expected, rtol=1e-5)
+
+
 def test_a_light_without_a_partner_fades_where_it_is():
     first, second = sky((12, 30), 20000, 0.2), sky(None, 0, 0.2)
     (before,) = lights_of(first)

@@ -102,6 +102,13 @@ def test_a_target_is_a_file_or_a_turn_and_the_last_one_given_counts():
         assert cleared.file == "" and cleared.rotate_degrees == "auto"
 
 
+def test_the_tonemap_of_a_target_file_counts_as_the_file_may_be_a_picture():
+    text = "[target]\ntonemap = 'gamma'"
+    assert cfg.unused(cfg.loads(f"{text}\nfile = 'b.png'")) == []
+    (said,) = cfg.unused(cfg.loads(text))
+    assert said.startswith("target.tonemap: no effect")
+
+
 def test_a_gaussian_light_has_no_softness():
     added = {"azimuth": 90, "elevation": 30, "flux": [1, 1, 1]}
     lights = [added | {"softness": 0.5}, added | {"softness": 0.5, "shape": "disc"}, added | {"softness": 0}]

@@ -241,6 +241,17 @@ def test_a_file_of_a_target_map_that_is_no_panorama_is_a_picture(ball, pictured,
         target.make(asking(file=str(floats(tmp_path / "b.exr", pictured[1][:, :10]))), ball, pictured[0])
 
 
+def test_a_target_of_2_to_1_is_a_map_with_a_warning_where_the_rendering_is_2_to_1_too(tmp_path, rng):
+    sensor = SENSOR.replace('"height" value="12"', '"height" value="8"')
+    wide = scene.load(write_scene(tmp_path, sensor, BALL, LIGHT))
+    assert (wide.width, wide.height) == (16, 8)
+    file = str(floats(tmp_path / "a.exr", sky(rng)))
+    made = target.make(asking(file=file), wide, sky(rng))
+    assert made.envmap is not None and "a.exr: is 2:1, as the rendering is" in made.warnings[0]
+    assert 'target.kind = "rendering"' in made.warnings[0]
+    assert not target.make(asking(), wide, sky(rng)).warnings
+
+
 @pytest.mark.slow
 def test_a_painted_image_that_was_rendered_anew_is_solved_as_a_rendering(tmp_path, rng):
     """And one that was painted all over the rendering is not; a mask says that it was painted."""

@@ -137,6 +137,18 @@ def test_the_ratio_to_the_sky_and_the_flux_are_as_asked(tmp_path, capsys):
     capsys.readouterr()
 
 
+@pytest.mark.parametrize("option", ["--flux", "--ratio"])
+def test_in_a_sky_that_is_clipped_all_over_a_sun_has_the_colour_of_the_analytic_one(option, tmp_path, capsys):
+    white = np.full((32, 64, 3), 0.5, np.float32)
+    assert of_file(tmp_path, white, option, "3") == 0
+    added = images.read(tmp_path / "out.exr")[0].astype(np.float64) - white
+    flux = (added * latlong.lookup_solid_angles(32, 64)[:, None, None]).sum(axis=(0, 1))
+    facts = json.loads(capsys.readouterr().out)
+    np.testing.assert_allclose(flux, facts["flux"], rtol=0.02)
+    sun, _ = unclip.analytic_fluxes(facts["light"]["elevation"])
+    np.testing.assert_allclose(flux / luminance(flux), sun / luminance(sun), rtol=0.02)
+
+
 @pytest.mark.parametrize("flux", [["1", "2"], ["0"]])
 def test_a_flux_of_two_numbers_or_of_nothing_is_refused(flux, tmp_path, capsys):
     assert of_file(tmp_path, overcast(), "--flux", *flux) == 2

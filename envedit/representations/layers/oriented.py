@@ -61,13 +61,19 @@ def add_rotated(envmap: np.ndarray, light: Light, matrix: np.ndarray, flux: np.n
     """
     height, width = envmap.shape[:2]
     omega = latlong.lookup_solid_angles(height, width)
+    row, column = np.divmod(light.texels, width)
+    own = (omega[row][:, None] * np.float64(light.radiance)).sum(axis=0)
+    aim = own if flux is None else flux
+
+    # ---- A light that stays keeps its texels, and the shape that resampling would blur
+    if (matrix == np.eye(3)).all():
+        envmap[row, column] += _scaled(light.radiance, own, aim)
+        return
 
     # ---- The light alone, in the rows that hold it
-    row, column = np.divmod(light.texels, width)
     first, last = max(int(row.min()) - 1, 0), min(int(row.max()) + 2, height)
     alone = np.zeros((last - first, width, 3), np.float32)
     alone[row - first, column] = light.radiance
-    own = (omega[row][:, None] * np.float64(light.radiance)).sum(axis=0)
 
     # ---- The rows that it comes to, with a margin of a texel and its interpolation
     theta = np.pi * row / (height - 1)
@@ -77,9 +83,12 @@ def add_rotated(envmap: np.ndarray, light: Light, matrix: np.ndarray, flux: np.n
     bottom = min(int(place.max()) + 4, height)
     image = resampled(alone, matrix, (first, height), (top, bottom), LIGHT_SAMPLES)
     got = np.einsum("h,hwc->c", omega[top:bottom], image, dtype=np.float64)
-    aim = own if flux is None else flux
-    image *= np.where(got > 0, aim / np.where(got > 0, got, 1), 0).astype(np.float32)
-    envmap[top:bottom] += image
+    envmap[top:bottom] += _scaled(image, got, aim)
+
+
+def _scaled(image, flux, aim):
+    """Return radiance (..., 3) of a flux (3,) with another one; a channel without flux stays black."""
+    return image * np.where(flux > 0, aim / np.where(flux > 0, flux, 1), 0).astype(np.float32)
 
 
 def resampled(

@@ -90,9 +90,9 @@ def estimate(light: ClippedLight) -> Estimate:
     haze = _haze(light.elevation)
 
     # ---- Two estimates of the logarithm, and their mean, weighted by precision
-    ring = light.rings[light.first or 0]
-    by_aureole = _log2(luminance(ring)) - AUREOLE[first] - HAZE_STOPS * haze
     sun, sky = analytic_fluxes(light.elevation)
+    ring = sun if light.first is None else light.rings[light.first]  # clipped all around: the sun's colour
+    by_aureole = _log2(luminance(ring)) - AUREOLE[first] - HAZE_STOPS * haze
     by_sky = _log2(luminance(light.sky_irradiance)) + _log2(luminance(sun)) - _log2(luminance(sky))
     by_sky += float(np.interp(haze, (0, 1), SKY_OFFSET))
     precision = np.array([AUREOLE_STOPS[0 if near else 1], SKY_STOPS]) ** -2.0

@@ -366,8 +366,8 @@ def _rendered(settings, scene, envmap, other):
         true = inputs.scaled(true, scene.own.scale, str(chosen.file))
         source = f"rendered under {chosen.file}"
         warnings = tuple(f"{info['path']}: {line}" for line in info["warnings"])
-        if other is None and any(scene.width == 2 * (rows.stop - rows.start) for rows in scene.rows):
-            line = "is 2:1, as the rendering is, and read as a map"
+        if other is None and info["size"] in {(scene.width, rows.stop - rows.start) for rows in scene.rows}:
+            line = "is 2:1 and read as a map, though of the size of the rendering"
             remedy = 'for a picture of the scene set target.kind = "rendering"'
             warnings = (*warnings, f"{file}: {line}; {remedy}")
     else:

@@ -41,7 +41,8 @@ def seen(rng, spp=(256, 32)):
 
 
 def target(picture, weight=None):
-    return Target(picture.astype(np.float32), weight, None, "")
+    everywhere = np.ones((*picture.shape[:2], 1), np.float32)
+    return Target(picture.astype(np.float32), everywhere if weight is None else weight, None, "")
 
 
 def test_weights_have_a_mean_of_one_and_are_told(rng):

@@ -241,15 +241,15 @@ def test_a_file_of_a_target_map_that_is_no_panorama_is_a_picture(ball, pictured,
         target.make(asking(file=str(floats(tmp_path / "b.exr", pictured[1][:, :10]))), ball, pictured[0])
 
 
-def test_a_target_of_2_to_1_is_a_map_with_a_warning_where_the_rendering_is_2_to_1_too(tmp_path, rng):
+def test_a_target_of_2_to_1_is_a_map_with_a_warning_where_it_has_the_size_of_the_rendering(tmp_path, rng):
     sensor = SENSOR.replace('"height" value="12"', '"height" value="8"')
     wide = scene.load(write_scene(tmp_path, sensor, BALL, LIGHT))
-    assert (wide.width, wide.height) == (16, 8)
-    file = str(floats(tmp_path / "a.exr", sky(rng)))
-    made = target.make(asking(file=file), wide, sky(rng))
-    assert made.envmap is not None and "a.exr: is 2:1, as the rendering is" in made.warnings[0]
-    assert 'target.kind = "rendering"' in made.warnings[0]
-    assert not target.make(asking(), wide, sky(rng)).warnings
+    maps = [floats(tmp_path / f"{width}.exr", rng.random((width // 2, width, 3))) for width in (16, 32)]
+    made = [target.make(asking(file=str(file)), wide, sky(rng)) for file in maps]
+    assert all(one.envmap is not None for one in made)
+    assert not any("read as a map" in line for line in made[1].warnings)
+    assert "16.exr: is 2:1 and read as a map" in made[0].warnings[-1]
+    assert 'target.kind = "rendering"' in made[0].warnings[-1]
 
 
 @pytest.mark.slow

@@ -77,6 +77,11 @@ class Document:
         return placed, self.regions, self.orientation
 
     @property
+    def painting(self) -> tuple:
+        """What decides what is solved for on that map: not how the solution's map is adjusted."""
+        return self.strokes, self.rest, self.freedom
+
+    @property
     def orientation(self) -> Orientation:
         """How the map is rotated as a whole, after its lights are placed."""
         return Orientation(self.rotate_degrees, self.tilt_degrees, self.horizon_degrees)

@@ -28,7 +28,7 @@ import numpy as np
 from envedit import inputs, pipeline, renderers
 from envedit.cli.paint import advice, picking
 from envedit.cli.paint.project import MATCHED, SOLUTION, Project
-from envedit.cli.paint.protocol import TABLES, Document, Edit, Pick
+from envedit.cli.paint.protocol import TABLES, Edit, Pick
 from envedit.cli.paint.solution import COLUMNS, Solution
 from envedit.core import latlong
 from envedit.core.arrays import tensor
@@ -96,7 +96,6 @@ class Session:
         # ---- What is edited, and what has come of it
         self.project = project
         self.tell = tell
-        self.document = Document()
         self.resting = False
         self.phase = "done"
         self.status: dict[str, Any] = {"iterations": 0, "steps": 0, "number": 0, "client": ""}
@@ -144,7 +143,9 @@ class Session:
 
         # ---- What solves for an edit
         self.solution = Solution(settings, self.scene, self.placed, self.transport, self.rows)
-        self._aim(self._usable(project.document))
+        # What is painted, with a stroke that is being drawn or a light that is being dragged, and without
+        self.document = self.finished = self._usable(project.document)
+        self._aim(self.document)
         if project.start and self.solving:
             self._go_on_from(project.start)
 
@@ -179,7 +180,8 @@ class Session:
     def update(self, edit: Edit) -> None:
         """Take a document: paint, move lights, and show what is known at once.
 
-        One that cannot be painted or shown is refused: that before it stays, and pages get it back.
+        One that cannot be painted or shown is refused: the last that was finished stays, and pages get it
+        back.
         """
         began = time.perf_counter()
         before, self.document = self.document, edit.document
@@ -194,27 +196,36 @@ class Session:
                 self._drag()
             elif moved or self._dragged:
                 self._aim(edit.document)
-            else:
+            elif before.painting != edit.document.painting:
                 self._paint()
                 self.reach = reach
+            else:  # the solution stays, as does which of its explanations was chosen
+                self.advised = False
             self._show()
         except Exception:
             self.phase = "done"
-            self._aim(before)
+            self._aim(self.finished)
             self._show()
-            self._tell_document("")
+            self.tell_document()
             raise
-        self._tell_document(edit.client)
-        if edit.phase == "done" and self.document != self._kept:
-            self.project.keep(self.document)
-            self._kept = self.document
+        if edit.phase == "done":
+            self.finished = self.document
+            self.tell_document(edit.client)
+            if self.document != self._kept:
+                self.project.keep(self.document)
+                self._kept = self.document
         self.status["ms"] = round(1000 * (time.perf_counter() - began), 1)
         self._give_back_memory()  # edits may come so fast that nothing is done between them
         self.tell_state()
 
-    def _tell_document(self, client):
+    def give_up_unfinished(self) -> None:
+        """Go back to the document that was finished last: the page that draws or drags has gone, or saves."""
+        if self.phase != "done":
+            self.update(Edit(self.finished))
+
+    def tell_document(self, client: str = "") -> None:
         """Say what is painted, to all pages but the one that has painted it."""
-        self.tell.say({"type": "document", "client": client, "document": self.document.plain()})
+        self.tell.say({"type": "document", "client": client, "document": self.finished.plain()})
 
     @property
     def solving(self) -> bool:

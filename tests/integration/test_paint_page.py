@@ -680,6 +680,36 @@ def test_what_is_given_up_is_undone_and_keys_work_beside_sliders(browser, file):
         until(lambda: page.picture("render") == shown)
 
 
+DROP = """([target, name]) => {
+  const data = new DataTransfer();
+  data.items.add(new File(["no image"], name));
+  document.querySelector(target).dispatchEvent(
+    new DragEvent("drop", { dataTransfer: data, bubbles: true, cancelable: true }));
+}"""
+"""Drop a file somewhere on the page."""
+
+
+def test_files_that_are_not_taken_are_told(browser, file, tmp_path, here):
+    with opened(browser, file) as (page, *_):
+        said = sync_api.expect(page.get("message"))
+        page.page.evaluate(DROP, ["#render", "sky.png"])
+        said.to_contain_text("sky.png was not taken")
+        (tmp_path / "look.toml").write_bytes(b"#" * (1 << 19))
+        page.get("look-file").set_input_files(tmp_path / "look.toml")
+        said.to_contain_text("look.toml is no look")
+        page.get("add").click()
+        said.to_be_empty()  # what went wrong before
+    with served(None) as server:
+        page = Page(browser, server.url)
+        sync_api.expect(page.status).to_contain_text("Choose")
+        page.page.evaluate(DROP, ["body", "sky.exr"])
+        sync_api.expect(page.get("open-map")).to_have_value("maps/sky.exr")
+        page.page.route("**/map/*", lambda route: route.abort())  # as where the server has gone
+        page.page.evaluate(DROP, ["#drop", "other.exr"])
+        sync_api.expect(page.get("message")).to_contain_text("other.exr was not taken")
+        sync_api.expect(page.status).to_contain_text("Choose")
+
+
 @pytest.mark.skipif(FIREFOX, reason="touches are sent by Chromium's protocol")
 def test_fingers_paint_and_zoom_on_a_tablet(browser, file):
     context = browser.new_context(viewport={"width": 820, "height": 1180}, has_touch=True)

@@ -137,18 +137,28 @@ def test_what_is_unfinished_is_nobody_elses_and_not_saved(server):
         painted(one, 31, half, phase="drawing")
         until(lambda: session.phase == "drawing")
         send(one, "save")
-        heard(one, "saved")
+        heard(one, "status", lambda m: m["state"] == "saving")
+        states, told = set(), {}
+        while told.get("type") != "saved":
+            received = one.recv(timeout=60)
+            told = json.loads(received) if isinstance(received, str) else {}
+            states |= {told["state"]} if told.get("type") == "status" else set()
+        assert states <= {"saving"}, "what else goes on is told while it is saved"
+        assert "saved" in server.hub.last
         assert session.document.strokes == session.finished.strokes and len(session.finished.strokes) == 1
+        painted(one, 32, {**whole, "exposure": 1})
+        assert "saved" not in server.hub.last, "a page that comes is told that this is saved"
+        painted(one, 33, whole)
         # ---- A message that is refused: the page gets what is painted
-        send(one, "document", number=32, document={"strokes": [stroke, {"type": "rain"}]})
+        send(one, "document", number=34, document={"strokes": [stroke, {"type": "rain"}]})
         assert "rain" in heard(one, "refused")["text"]
         assert len(heard(one, "document", lambda m: not m["client"])["document"]["strokes"]) == 1
         # ---- A page that comes anew, as where it is reloaded while a stroke is drawn
-        painted(one, 33, dark, phase="drawing")
+        painted(one, 35, dark, phase="drawing")
         with connected(server) as again:
             assert len(heard(again, "opened")["document"]["strokes"]) == 1
             until(lambda: session.phase == "done" and len(session.document.strokes) == 1)
-        painted(one, 34, {})
+        painted(one, 36, {})
 
 
 def test_done_is_told_once_and_what_goes_on_by_one_word_each(server):

@@ -332,7 +332,9 @@ class Session:
 
     @property
     def state(self) -> str:
-        """What goes on: moving (of lights), solving or rendering; done: nothing is left to do."""
+        """What goes on: saving, moving (of lights), solving or rendering; done: nothing is left to do."""
+        if self._saving:
+            return "saving"
         if self._dragged:
             return "moving"
         if self.resting:

@@ -113,9 +113,9 @@ class Worker(threading.Thread):
         elif isinstance(request, Sky):
             self.session.sky()
         elif isinstance(request, Save):
+            self.session.give_up_unfinished()
             self.tell.say({"type": "status", "state": "saving", "text": "saving"})
             try:
-                self.session.give_up_unfinished()
                 self.session.save()
             finally:
                 self.session.tell_state()

@@ -19,7 +19,7 @@ const displays = {
   difference: new Display($("difference"), "signed"),
   unreachable: new Display($("unreachable"), "values"),
 };
-const WORDS = { moving: "Moving", solving: "Solving", rendering: "Rendering", done: "Done" };
+const WORDS = { saving: "Saving", moving: "Moving", solving: "Solving", rendering: "Rendering", done: "Done" };
 const NAMES = { transport: "live", mitsuba: "path traced", saved: "saved" };
 const log = []; // of edits and frames, for measurements
 window.envedit = { log, advise };

@@ -31,7 +31,7 @@ class Again:
 
 
 class Refused:
-    """A message of a page was refused: tell it what is painted, which the page may show otherwise."""
+    """A message of a page was refused: send it what is painted, which the page may show otherwise."""
 
 
 class Worker(threading.Thread):

@@ -74,6 +74,8 @@ def test_what_is_saved_is_the_solution_that_is_shown(tmp_path):
         heard(page, "opened")
         hold = server.worker.session.solution.hold
         assert hold == FOLLOWING, "the saved solution is not what is opened"
+        painted(page, 1, wanted | {"exposure": 1.0})
+        assert 'start = "painted.npz"' in kept.read_text(), "the solution of what is adjusted is lost"
         painted(page, 2, {"strokes": [erased, erased]})
         assert not {"start", "iterations"} & set(kept.read_text().split()), "the solution of other strokes"
 

@@ -624,6 +624,92 @@ def test_a_photograph_is_compared_with_the_rendering(browser, tmp_path):
         assert page.picture("render") != photograph
 
 
+def slid_out_and_back(page, name):
+    """Drag a slider from where it is and back there, with the pointer."""
+    slider = page.get(name)
+    slider.scroll_into_view_if_needed()
+    box = slider.bounding_box()
+    x, y, value = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2, slider.input_value()
+    page.drag((x, y), (x + 20, y), (x, y))
+    assert slider.input_value() == value, "the slider was not dragged back"
+
+
+def test_what_is_given_up_is_undone_and_keys_work_beside_sliders(browser, file):
+    with opened(browser, file) as (page, server, kept):
+        session = server.worker.session
+        # ---- A slider that is dragged out and back has changed nothing, and its drag is over
+        page.get("handle-1").click()
+        for name in ("map-exposure-slide", "light-flux"):
+            slid_out_and_back(page, name)
+            page.page.wait_for_function("() => envedit.log.findLast((e) => e.edit)?.phase === 'done'")
+            until(lambda: session.phase == "done")
+        # ---- The drag of a highlight that Escape ends is given up, also by a click on its handle
+        page.page.keyboard.press("8")
+        before = session.finished
+        page.drag(page.at("#overlay", 0.45, 0.3), page.at("#overlay", 0.5, 0.4))
+        until(lambda: session.finished != before)
+        moved = session.finished
+        page.page.mouse.move(*page.at("#overlay", 0.5, 0.4))
+        page.page.mouse.down()
+        page.page.mouse.move(*page.at("#overlay", 0.55, 0.45), steps=3)
+        until(lambda: session.document != moved)
+        page.page.keyboard.press("Escape")
+        page.page.mouse.up()
+        until(lambda: session.phase == "done")
+        page.get("handle-1").click()
+        page.settled(False)
+        assert session.document == session.finished == moved
+        # ---- Keys where a slider or a number has the focus: what was typed is saved
+        page.get("freedom").focus()
+        page.page.keyboard.press("Control+z")
+        until(lambda: session.finished == before)
+        page.page.keyboard.press("2")
+        sync_api.expect(page.get("tool-shadow")).to_have_attribute("aria-pressed", "true")
+        page.get("map-exposure").focus()
+        page.page.keyboard.press("Control+a")
+        page.page.keyboard.type("1")
+        page.page.keyboard.press("Control+s")
+        sync_api.expect(page.get("message")).to_contain_text("Saved in", timeout=240_000)
+        assert config.load(kept).output.exposure == 1
+        # ---- B is released in another window
+        page.get("overlay").focus()
+        shown = page.picture("render")
+        page.page.keyboard.down("b")
+        until(lambda: page.picture("render") != shown)
+        page.page.evaluate("() => window.dispatchEvent(new Event('blur'))")
+        until(lambda: page.picture("render") == shown)
+
+
+DROP = """([target, name]) => {
+  const data = new DataTransfer();
+  data.items.add(new File(["no image"], name));
+  document.querySelector(target).dispatchEvent(
+    new DragEvent("drop", { dataTransfer: data, bubbles: true, cancelable: true }));
+}"""
+"""Drop a file somewhere on the page."""
+
+
+def test_files_that_are_not_taken_are_told(browser, file, tmp_path, here):
+    with opened(browser, file) as (page, *_):
+        said = sync_api.expect(page.get("message"))
+        page.page.evaluate(DROP, ["#render", "sky.png"])
+        said.to_contain_text("sky.png was not taken")
+        (tmp_path / "look.toml").write_bytes(b"#" * (1 << 19))
+        page.get("look-file").set_input_files(tmp_path / "look.toml")
+        said.to_contain_text("look.toml is no look")
+        page.get("add").click()
+        said.to_be_empty()  # what went wrong before
+    with served(None) as server:
+        page = Page(browser, server.url)
+        sync_api.expect(page.status).to_contain_text("Choose")
+        page.page.evaluate(DROP, ["body", "sky.exr"])
+        sync_api.expect(page.get("open-map")).to_have_value("maps/sky.exr")
+        page.page.route("**/map/*", lambda route: route.abort())  # as where the server has gone
+        page.page.evaluate(DROP, ["#drop", "other.exr"])
+        sync_api.expect(page.get("message")).to_contain_text("other.exr was not taken")
+        sync_api.expect(page.status).to_contain_text("Choose")
+
+
 @pytest.mark.skipif(FIREFOX, reason="touches are sent by Chromium's protocol")
 def test_fingers_paint_and_zoom_on_a_tablet(browser, file):
     context = browser.new_context(viewport={"width": 820, "height": 1180}, has_touch=True)

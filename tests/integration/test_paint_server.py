@@ -126,6 +126,41 @@ def test_two_pages_see_one_painting_and_one_that_comes_back_has_it_all(server):
     until(lambda: server.worker.session.document == Document())
 
 
+def test_what_is_unfinished_is_nobody_elses_and_not_saved(server):
+    stroke = {"type": "shadow", "ellipse": [0.5, 0.8, 0.2, 0.1], "amount": 0.3}
+    whole, half, dark = ({"strokes": n * [stroke]} for n in (1, 2, 3))
+    session = server.worker.session
+    with connected(server) as one, connected(server) as other:
+        heard(one, "opened"), heard(other, "opened")
+        send(one, "document", number=30, document=whole)
+        assert len(heard(other, "document")["document"]["strokes"]) == 1
+        painted(one, 31, half, phase="drawing")
+        until(lambda: session.phase == "drawing")
+        send(one, "save")
+        heard(one, "status", lambda m: m["state"] == "saving")
+        states, told = set(), {}
+        while told.get("type") != "saved":
+            received = one.recv(timeout=60)
+            told = json.loads(received) if isinstance(received, str) else {}
+            states |= {told["state"]} if told.get("type") == "status" else set()
+        assert states <= {"saving"}, "what else goes on is told while it is saved"
+        assert "saved" in server.hub.last
+        assert session.document.strokes == session.finished.strokes and len(session.finished.strokes) == 1
+        painted(one, 32, {**whole, "exposure": 1})
+        assert "saved" not in server.hub.last, "a page that comes is told that this is saved"
+        painted(one, 33, whole)
+        # ---- A message that is refused: the page gets what is painted
+        send(one, "document", number=34, document={"strokes": [stroke, {"type": "rain"}]})
+        assert "rain" in heard(one, "refused")["text"]
+        assert len(heard(one, "document", lambda m: not m["client"])["document"]["strokes"]) == 1
+        # ---- A page that comes anew, as where it is reloaded while a stroke is drawn
+        painted(one, 35, dark, phase="drawing")
+        with connected(server) as again:
+            assert len(heard(again, "opened")["document"]["strokes"]) == 1
+            until(lambda: session.phase == "done" and len(session.document.strokes) == 1)
+        painted(one, 36, {})
+
+
 def test_done_is_told_once_and_what_goes_on_by_one_word_each(server):
     stroke = {"type": "erase-shadow", "ellipse": [0.62, 0.3, 0.12, 0.12], "softness": 0.05}
     told, kept = [], {"strokes": [stroke], "rest": "keep"}

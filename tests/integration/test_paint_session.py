@@ -128,6 +128,10 @@ def test_other_explanations_are_shown_and_gone_on_from(painting):
     other = session.solution.point.rendering
     assert heard.last["status"]["reached"] != reached
     assert np.abs(other - session.solution.base).max() > 0.01
+    named = [{"light": 1, "flux": [1.0, 1.0, 1.0], "size": 1.0, "name": "sun"}]
+    solved(painting, strokes=[ERASED], exposure=1.0, lights=named)  # change nothing that is solved for
+    assert heard.last["explanations"]["chosen"] == 1
+    assert np.array_equal(session.solution.point.rendering, other)
 
     session.choose(0)  # as it was left
     assert all(np.array_equal(session.solution.run.state[name], first[name]) for name in first)

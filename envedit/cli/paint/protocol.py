@@ -76,6 +76,11 @@ class Document:
         placed = [light for light in lights if light != unchanged(light.get("light"))]
         return placed, self.regions, self.orientation
 
+    def solved_as(self, other: Document) -> bool:
+        """Whether another document has the same solution, which may be adjusted otherwise."""
+        same = (getattr(self, name) == getattr(other, name) for name in ("strokes", "rest", "freedom"))
+        return all(same) and self.placing == other.placing
+
     @property
     def orientation(self) -> Orientation:
         """How the map is rotated as a whole, after its lights are placed."""

@@ -24,7 +24,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from envedit.cli.paint import project, protocol, taken_files, thumbnails
 from envedit.cli.paint.session import Tell
-from envedit.cli.paint.worker import Again, Worker
+from envedit.cli.paint.worker import Again, Refused, Worker
 from envedit.core import shipped
 from envedit.core.types import Views
 from envedit.report import output_folder
@@ -94,6 +94,8 @@ class Hub(Tell):
         key = f"thumbnail {message['file']}" if kind == "thumbnail" else kind
         if kind == "status":
             message = {**message, "frame": self.count}
+        if kind in ("opened", "document"):  # what is painted is no longer what was saved
+            self.last.pop("saved", None)
         if kind == "document":
             self.last["opened"] = {**self.last["opened"], "document": message["document"]}
         if kind in _KEPT:
@@ -276,6 +278,7 @@ class Server:
                     request = await asyncio.to_thread(protocol.read, given, client.name)
                 except protocol.BadMessageError as error:
                     client.put("error", {"type": "refused", "text": str(error)})
+                    self.worker.post(Refused())
                     continue
                 if isinstance(request, protocol.Open):
                     self.thumbnails.stop()

@@ -28,7 +28,7 @@ import numpy as np
 from envedit import inputs, pipeline, renderers
 from envedit.cli.paint import advice, picking
 from envedit.cli.paint.project import MATCHED, SOLUTION, Project
-from envedit.cli.paint.protocol import TABLES, Document, Edit, Pick
+from envedit.cli.paint.protocol import TABLES, Edit, Pick
 from envedit.cli.paint.solution import COLUMNS, Solution
 from envedit.core import latlong
 from envedit.core.arrays import tensor
@@ -96,12 +96,12 @@ class Session:
         # ---- What is edited, and what has come of it
         self.project = project
         self.tell = tell
-        self.document = Document()
         self.resting = False
         self.phase = "done"
         self.status: dict[str, Any] = {"iterations": 0, "steps": 0, "number": 0, "client": ""}
         self.reach: feasibility.Reach | None = None  # of what is painted, once it is known
-        self._kept = project.document  # as painted.toml has it
+        # As painted.toml has them: what is painted, and the solution of it, "" without one
+        self._kept, self._kept_solution = project.document, SOLUTION if project.start else ""
         self._saving: bool = False
         self._dragged = False
         self.newer = lambda: not self._saving and newer()
@@ -143,7 +143,9 @@ class Session:
 
         # ---- What solves for an edit
         self.solution = Solution(settings, solved_on, self.placed, small, self.rows)
-        self._aim(self._usable(project.document))
+        # What is painted, with a stroke that is being drawn or a light that is being dragged, and without
+        self.document = self.finished = self._usable(project.document)
+        self._aim(self.document)
         if project.start and self.solving:
             self._go_on_from(project.start)
 
@@ -182,7 +184,8 @@ class Session:
     def update(self, edit: Edit) -> None:
         """Take a document: paint, move lights, and show what is known at once.
 
-        One that cannot be painted or shown is refused: that before it stays, and pages get it back.
+        One that cannot be painted or shown is refused: the last that was finished stays, and pages get it
+        back.
         """
         began = time.perf_counter()
         before, self.document = self.document, edit.document
@@ -197,27 +200,40 @@ class Session:
                 self._drag()
             elif moved or self._dragged:
                 self._aim(edit.document)
+            elif edit.document.solved_as(before):  # the solution stays, and which explanation was chosen
+                self.advised = False
             else:
                 self._paint()
                 self.reach = reach
             self._show()
         except Exception:
             self.phase = "done"
-            self._aim(before)
+            self._aim(self.finished)
             self._show()
-            self._tell_document("")
+            self.tell_document()
             raise
-        self._tell_document(edit.client)
-        if edit.phase == "done" and self.document != self._kept:
-            self.project.keep(self.document)
-            self._kept = self.document
+        if edit.phase == "done":
+            self.finished = self.document
+            self.tell_document(edit.client)
+            if self.document != self._kept:
+                self._keep(self._kept_solution if self.document.solved_as(self._kept) else "")
         self.status["ms"] = round(1000 * (time.perf_counter() - began), 1)
         self._give_back_memory()  # edits may come so fast that nothing is done between them
         self.tell_state()
 
-    def _tell_document(self, client):
+    def _keep(self, solution):
+        """Write ``painted.toml``, with the solution of what is painted, "" without one."""
+        self.project.keep(self.document, solution)
+        self._kept, self._kept_solution = self.document, solution
+
+    def give_up_unfinished(self) -> None:
+        """Go back to the document that was finished last: the page that draws or drags has gone, or saves."""
+        if self.phase != "done":
+            self.update(Edit(self.finished))
+
+    def tell_document(self, client: str = "") -> None:
         """Say what is painted, to all pages but the one that has painted it."""
-        self.tell.say({"type": "document", "client": client, "document": self.document.plain()})
+        self.tell.say({"type": "document", "client": client, "document": self.finished.plain()})
 
     @property
     def solving(self) -> bool:
@@ -326,7 +342,9 @@ class Session:
 
     @property
     def state(self) -> str:
-        """What goes on: moving (of lights), solving or rendering; done: nothing is left to do."""
+        """What goes on: saving, moving (of lights), solving or rendering; done: nothing is left to do."""
+        if self._saving:
+            return "saving"
         if self._dragged:
             return "moving"
         if self.resting:
@@ -627,8 +645,7 @@ class Session:
         while self._solved_further(settled=True):
             pass
         start = SOLUTION if self.solving else ""
-        project.keep(self.document, start)
-        self._kept = self.document
+        self._keep(start)
         if start:
             run = self.solution.run
             solved = gauss_newton.Run(run.state, run.start, hold=self.solution.hold)

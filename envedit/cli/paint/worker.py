@@ -30,6 +30,10 @@ class Again:
     """A page has come: show it everything."""
 
 
+class Refused:
+    """A message of a page was refused: send it what is painted, which the page may show otherwise."""
+
+
 class Worker(threading.Thread):
     """Carries requests out, one at a time, and what goes on between them; ``tell`` receives every message."""
 
@@ -76,7 +80,7 @@ class Worker(threading.Thread):
             with self._lock:
                 while not (self._waiting or busy or self._over):
                     self._lock.wait()
-                kinds = [kind for kind in (*ORDER, Again) if kind in self._waiting]
+                kinds = [kind for kind in (*ORDER, Refused, Again) if kind in self._waiting]
                 owed, self._owed = self._owed and busy, False
                 request = self._waiting.pop(kinds[0]) if kinds and not owed else None
             if self._over:
@@ -93,11 +97,13 @@ class Worker(threading.Thread):
         if isinstance(request, Open):
             self._open_next(project.opened(request.name, request.envmap))
         elif self.session is None:
-            if not isinstance(request, Again):
+            if not isinstance(request, Again | Refused):
                 self.tell.say({"type": "error", "text": "no scene is open: open one first"})
         elif isinstance(request, Edit):
             if request.painting in (0, self._painting):
                 self.session.update(request)
+        elif isinstance(request, Refused):
+            self.session.tell_document()
         elif isinstance(request, Pick):
             self.session.pick(request)
         elif isinstance(request, Choose):
@@ -107,12 +113,14 @@ class Worker(threading.Thread):
         elif isinstance(request, Sky):
             self.session.sky()
         elif isinstance(request, Save):
+            self.session.give_up_unfinished()
             self.tell.say({"type": "status", "state": "saving", "text": "saving"})
             try:
                 self.session.save()
             finally:
                 self.session.tell_state()
         else:
+            self.session.give_up_unfinished()
             self.session.again()
 
     def _apply(self, request):
@@ -131,7 +139,7 @@ class Worker(threading.Thread):
                 file = taken_files.place(part, name)
         except OSError as error:
             raise InputError(f"{taken_files.MAPS}/{name}: not written: {error.strerror}") from None
-        self._open_next(project.on_another_map(session.project, session.document, file))
+        self._open_next(project.on_another_map(session.project, session.finished, file))
         said = [f"The map has the light of {request.name}: {file}", *warnings]
         self.tell.say({"type": "note", "text": ". ".join(said)})
 

@@ -19,6 +19,16 @@ export function consume(event) {
   event.stopPropagation();
 }
 
+// An input says "change" only where it ends elsewhere than it began: it ends as well with the pointer, or the focus.
+export function slides(input, moved, ended) {
+  let due = false;
+  input.addEventListener("input", () => { due = true; moved(); });
+  for (const end of ["change", "pointerup", "blur"]) input.addEventListener(end, () => {
+    if (due) ended();
+    due = false;
+  });
+}
+
 // Follow the pointer that has pressed an element until it is released.
 export function follow(element, event, move, end, cancel = end) {
   element.setPointerCapture(event.pointerId);

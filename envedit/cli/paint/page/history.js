@@ -19,9 +19,12 @@ export class History {
   get undoable() { return this.at > 0; }
   get redoable() { return this.at < this.steps.length - 1; }
 
+  // What changes nothing is no step: it ends what was shown.
   push(change) {
+    const next = { ...this.document, ...change };
+    if (JSON.stringify(next) === JSON.stringify(this.document)) { this.changed("done"); return; }
     this.steps.length = this.at + 1;
-    this.steps.push({ ...this.document, ...change });
+    this.steps.push(next);
     if (this.steps.length > 500) this.steps.shift();
     this.at = this.steps.length - 1;
     this.changed("done");

@@ -1,7 +1,7 @@
 // The lights of the map as handles, and the panel of the one that is chosen.
 // Entries are as in [[input.lights]]: with `light` one of the map's own, with factors; without it an added one.
 
-import { $, ARROWS, button, clamp, consume, follow } from "./elements.js";
+import { $, ARROWS, button, clamp, consume, follow, slides } from "./elements.js";
 import { seen, unseen } from "./orientation.js";
 
 export class Lights {
@@ -14,10 +14,7 @@ export class Lights {
     this.draft = null;
     this.solo = -1;
     this.holder.addEventListener("pointerdown", (e) => this.turn(e));
-    for (const key of ["flux", "color", "size", ...SHAPED]) {
-      $(`light-${key}`).addEventListener("input", () => this.change(key));
-      $(`light-${key}`).addEventListener("change", () => this.commit());
-    }
+    for (const key of ["flux", "color", "size", ...SHAPED]) slides($(`light-${key}`), () => this.change(key), () => this.commit());
     $("light-mute").addEventListener("click", () => this.mute());
     $("light-delete").addEventListener("click", () => this.remove());
   }
@@ -73,6 +70,9 @@ export class Lights {
     this.on.done({ lights });
     this.draw();
   }
+
+  // Give up what is shown and not committed.
+  drop() { this.pending = this.draft = null; }
 
   // Move a light by degrees on the map as it is seen.
   moveBy(index, light, dx, dy) {

@@ -4,7 +4,7 @@ import { Chooser } from "./chooser.js";
 import { Compare } from "./compare.js";
 import { Connection } from "./connection.js";
 import { Display } from "./display.js";
-import { $, button } from "./elements.js";
+import { $, button, slides } from "./elements.js";
 import { EMPTY, History } from "./history.js";
 import { Level } from "./level.js";
 import { LightList } from "./light_list.js";
@@ -19,7 +19,7 @@ const displays = {
   difference: new Display($("difference"), "signed"),
   unreachable: new Display($("unreachable"), "values"),
 };
-const WORDS = { moving: "Moving", solving: "Solving", rendering: "Rendering", done: "Done" };
+const WORDS = { saving: "Saving", moving: "Moving", solving: "Solving", rendering: "Rendering", done: "Done" };
 const NAMES = { transport: "live", mitsuba: "path traced", saved: "saved" };
 const log = []; // of edits and frames, for measurements
 window.envedit = { log, advise };
@@ -30,6 +30,7 @@ const PICKS = {
   rim: ["rim", "lights the rim from this place on"], cast: ["cast", "casts a shadow here"], shares: ["shares"],
 };
 const ORIENTATION = [["degrees", "rotate_degrees"], ["tilt", "tilt_degrees"], ["horizon", "horizon_degrees"]]; // numbers, and their keys
+const LARGEST_LOOK = 1 << 18; // bytes; the server takes messages of four times that
 const AMOUNTS = { light: [2, 0.6], shadow: [1, 0.6], contrast: [4, 1.6] }; // largest, and what is chosen
 const frames = { render: [], map: [], difference: [], unreachable: [], before: [], photograph: [], explanation: [] }; // the last of each view
 
@@ -65,6 +66,7 @@ function flush() {
   const message = { type: "document", number: ++sent, painting, ...waiting };
   if (!connection.send(message)) return; // sent again when the server is back
   note({ edit: sent, phase: waiting.phase, since });
+  if (waiting.phase === "done" && !$("message").classList.contains("good")) say(""); // what went wrong before
   since = null;
   waiting = null;
 }
@@ -77,7 +79,7 @@ function note(entry) {
 // ---- from the server
 
 const connection = new Connection({
-  lost() { state("error", "The server cannot be reached; trying again"); },
+  lost() { state("error", "The server cannot be reached; trying again (one that was started anew has another address: see the terminal)"); },
   frame(frame) {
     if (frames[frame.kind]) frames[frame.kind][frame.view] = frame;
     if (frame.kind === "explanation") explanations[frame.view]?.show(frame);
@@ -190,7 +192,11 @@ const RECEIVED = {
     refresh();
   },
   thumbnail(message) { if (!opened) chooser.picture(message); },
-  document(message) { history.follow({ ...EMPTY, ...message.document }, !message.client); refresh(); },
+  document(message) {
+    lights.solo = -1;
+    history.follow({ ...EMPTY, ...message.document }, !message.client);
+    refresh();
+  },
   lights(message) { lights.set(message); },
   explanations(message) { explain(message); },
   status(message) {
@@ -280,7 +286,7 @@ const strokes = new Strokes($("overlay"), () => ({
 }), {
   preview(stroke) { history.preview({ strokes: [...history.document.strokes, stroke] }, "drawing"); },
   done(stroke) { history.push({ strokes: [...history.document.strokes, stroke] }); },
-  cancel() { send(history.document, "done"); },
+  cancel() { dropped = answered = asked; clearTimeout(unanswered); send(history.document, "done"); refresh(); },
   drag(phase, x, y, event) { pick(phase, x, y, event); },
 });
 
@@ -296,7 +302,7 @@ function viewed(stroke) {
 // A highlight or a shadow is dragged: first ask whose it is, then where that light must go. A drag is one step of
 // history: it ends with the answer to the last question, or after UNANSWERED where none comes.
 const UNANSWERED = 5000;
-let dragged = tool, picked = -1, point, place = null, asked = 0, answered = 0, ended = false, unanswered = 0, held = null;
+let dragged = tool, picked = -1, point, place = null, asked = 0, answered = 0, dropped = 0, ended = false, unanswered = 0, held = null;
 function pick(phase, x, y, event) {
   if (phase === "start") dragged = tool; // another may be chosen before all is answered
   const placing = PICKS[dragged][1];
@@ -327,7 +333,7 @@ function ask(x, y) {
   connection.send({ type: "pick", of: PICKS[dragged][0], point, x, y, light: picked, view, number: ++asked });
 }
 RECEIVED.picked = (message) => {
-  if (message.client !== client) return;
+  if (message.client !== client || message.number <= dropped) return; // of a drag that was given up
   answered = message.number;
   if (message.shares) {
     if (message.light >= 0) lights.choose(message.light);
@@ -400,7 +406,7 @@ function refresh() {
   $("rest").value = now.rest ?? "follow";
   $("freedom").value = now.freedom ?? 0;
   valued($("freedom"));
-  lights.draft = null;
+  lights.drop();
   lights.draw();
   level.draw();
   regions.draw();
@@ -438,11 +444,10 @@ for (const input of document.querySelectorAll("#options input[type=range]")) {
   valued(input);
 }
 $("rest").addEventListener("change", () => history.push({ rest: $("rest").value }));
-$("freedom").addEventListener("input", () => {
+slides($("freedom"), () => {
   valued($("freedom"));
   history.preview({ freedom: Number($("freedom").value) }, "drawing");
-});
-$("freedom").addEventListener("change", () => history.push({ freedom: Number($("freedom").value) }));
+}, () => history.push({ freedom: Number($("freedom").value) }));
 $("amount").addEventListener("input", () => { AMOUNTS[tool][1] = Number($("amount").value); });
 
 for (const button of document.querySelectorAll("[data-tool]")) button.addEventListener("click", () => choose("tool", button.dataset.tool));
@@ -477,8 +482,12 @@ for (const [id, key] of [...ORIENTATION, ["map-exposure", "exposure"], ["map-tem
 }
 
 async function put(kind, file) {
-  const answer = await fetch(`${kind}/${encodeURIComponent(file.name)}`, { method: "PUT", body: file });
-  return [answer.ok, await answer.text()];
+  try {
+    const answer = await fetch(`${kind}/${encodeURIComponent(file.name)}`, { method: "PUT", body: file });
+    return [answer.ok, await answer.text()];
+  } catch { // the server has gone, or hangs up on a file that is too large
+    return [false, `${file.name} was not taken: the server cannot be reached, or the file is too large`];
+  }
 }
 // A button that asks for a file.
 function asksFor(id, act) {
@@ -496,6 +505,7 @@ asksFor("light-image", async (file) => {
   else say(text);
 });
 asksFor("look", async (file) => {
+  if (file.size > LARGEST_LOOK) { say(`${file.name} is no look: ${file.size} bytes`); return; }
   say("");
   connection.send({ type: "look", name: file.name, text: await file.text() });
 });
@@ -503,8 +513,7 @@ asksFor("look", async (file) => {
 // The sliders of the whole map: 6500 K changes nothing.
 for (const [id, key, nothing] of [["map-exposure", "exposure", 0], ["map-temperature", "temperature", 6500]]) {
   const slide = $(`${id}-slide`), change = () => ({ [key]: Number(slide.value) === nothing ? 0 : Number(slide.value) });
-  slide.addEventListener("input", () => { $(id).value = change()[key]; history.preview(change(), "drawing"); });
-  slide.addEventListener("change", () => history.push(change()));
+  slides(slide, () => { $(id).value = change()[key]; history.preview(change(), "drawing"); }, () => history.push(change()));
 }
 
 function outline() {
@@ -521,16 +530,21 @@ function look(changed) {
 function save() {
   if (!opened || $("status").dataset.state === "saving") return;
   say("");
+  if (lights.solo >= 0) lights.hear(lights.solo); // nothing is kept of it
   if (connection.send({ type: "save" })) state("saving", "Saving");
 }
 
 window.addEventListener("keydown", (event) => {
-  if (!opened || event.target.matches("input, select") || $("keys").open || $("sky-dialog").open) return;
-  const key = event.key.toLowerCase(), lettered = [...document.querySelectorAll("[data-key]")].find((button) => button.dataset.key === key);
+  if (!opened || $("keys").open || $("sky-dialog").open) return;
+  const key = event.key.toLowerCase(), saves = key === "s" && (event.ctrlKey || event.metaKey), lettered = [...document.querySelectorAll("[data-key]")].find((button) => button.dataset.key === key);
+  if (event.target.matches("input:not([type=range], [type=color]), select")) { // is typed into
+    if (!saves) return;
+    event.target.blur(); // what was typed is saved
+  }
   if (event.ctrlKey || event.metaKey) {
     if (key === "z" && !event.shiftKey) history.undo();
     else if (key === "y" || key === "z") history.redo();
-    else if (key === "s") save();
+    else if (saves) save();
     else return;
   } else if (key === "b" && !event.repeat) displays.render.set({ split: 1 });
   else if (key === "o" && !event.repeat) outline();
@@ -552,9 +566,9 @@ window.addEventListener("keydown", (event) => {
   else return;
   event.preventDefault();
 });
-window.addEventListener("keyup", (event) => {
-  if (event.key.toLowerCase() === "b") displays.render.set({ split: Number($("split").value) });
-});
+const release = () => displays.render.set({ split: Number($("split").value) });
+window.addEventListener("keyup", (event) => { if (event.key.toLowerCase() === "b") release(); });
+window.addEventListener("blur", release); // another window has the key that is released
 window.addEventListener("resize", () => strokes.draw());
 
 // ---- start page
@@ -580,10 +594,14 @@ $("drop").addEventListener("keydown", (event) => { if (event.key === "Enter" || 
 $("file").addEventListener("change", () => { if ($("file").files[0]) upload($("file").files[0]); });
 $("drop").addEventListener("dragover", (event) => { event.preventDefault(); $("drop").classList.add("over"); });
 $("drop").addEventListener("dragleave", () => $("drop").classList.remove("over"));
-$("drop").addEventListener("drop", (event) => {
+// A file that is dropped anywhere; the browser would show it in place of the page.
+window.addEventListener("dragover", (event) => event.preventDefault());
+window.addEventListener("drop", (event) => {
   event.preventDefault();
   $("drop").classList.remove("over");
-  if (event.dataTransfer.files[0]) upload(event.dataTransfer.files[0]);
+  const [file] = event.dataTransfer.files;
+  if (opened && file) say(`${file.name} was not taken: another map is chosen where \`envedit paint\` starts without a scene`);
+  else if (file) upload(file);
 });
 
 choose("tool", "shadow");

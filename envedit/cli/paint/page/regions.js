@@ -1,6 +1,6 @@
 // Regions of the map as in [[input.regions]]: painted by a brush, shown over the map, and changed in a panel.
 
-import { $, ARROWS, button, clamp, consume, follow } from "./elements.js";
+import { $, ARROWS, button, clamp, consume, follow, slides } from "./elements.js";
 import { hex, linear } from "./lights.js";
 import { direction, unseen } from "./orientation.js";
 
@@ -25,10 +25,7 @@ export class Regions {
     canvas.addEventListener("keydown", (event) => this.key(event));
     $("region").addEventListener("click", () => this.toggle());
     $("region-remove").addEventListener("click", () => this.remove());
-    for (const input of INPUTS.map($)) {
-      input.addEventListener("input", () => this.change(false));
-      input.addEventListener("change", () => this.change(true));
-    }
+    for (const input of INPUTS.map($)) slides(input, () => this.change(false), () => this.change(true));
   }
 
   get active() { return !this.canvas.hidden; }

@@ -8,7 +8,7 @@ T is an estimate: it errs around bright areas that are too large for exact colum
 caustics. An edit that compares R(E) = T E + I_0 with the target t makes up for these errors by the map. Its
 last steps, from E^, are therefore made towards
 
-    t + R(E^) - I(E^),        R(E^) = T E^ + I_0 through T, I(E^) by Mitsuba,
+    R(E^) min(t / I(E^), 1) + max(t - I(E^), 0),        R(E^) = T E^ + I_0 through T, I(E^) by Mitsuba,
 
 so that T's error cancels near E^ (output space mapping, Bandler et al. 2004): where these steps end, it is
 the path-traced rendering that meets the target.

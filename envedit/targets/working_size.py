@@ -65,8 +65,8 @@ def worked_on(
     """Return the target of a scene as the picture of the ``small`` scene, the same on a smaller film.
 
     It is rendered anew, so that the film's filter is the same as in what it is compared with. What was
-    painted is the change of each pixel, averaged over its area and added to the smaller initial rendering,
-    under ``envmap`` (H, W, 3), the map that is edited.
+    painted is averaged over the area of each pixel, and asked for beside the smaller initial rendering, under
+    ``envmap`` (H, W, 3), the map that is edited.
     """
     chosen = settings.target
     hidden = hidden_pixels(small)
@@ -85,8 +85,9 @@ def worked_on(
         weight = np.where(hidden[..., None], 0, at_size(target.weight, scene, small)).astype(np.float32)
         return replace(target, picture=picture, noise=noise, spp=spp, weight=weight)
     initial = initial_rendering.initial(small, envmap, settings)
-    change = at_size(target.picture - target.initial, scene, small)
-    picture = np.clip(initial + change, 0, np.float32(BRIGHTEST))
+    averaged = replace(target, picture=at_size(target.picture, scene, small))
+    painted = averaged.seen_as(initial, at_size(target.initial, scene, small))
+    picture = np.minimum(painted.aim, np.float32(BRIGHTEST))
     coverage = np.where(hidden[..., None], 0, at_size(target.coverage, scene, small))
     uncounted = at_size((target.weight == 0).astype(np.float32), scene, small)[..., 0] > 0.5
     weight = pixel_weight(coverage, uncounted | hidden, chosen.paint, first_hold(settings))

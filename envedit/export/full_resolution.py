@@ -108,13 +108,12 @@ class _LayersAt:
         self._present = (flux > lights.DARK).any(axis=1)
         changed = turn[self._present].any() or flux[:own].any() or self._present[own:].any()
         self.relit = layers.lights.glowing and bool(changed)
-        moved = (turn != 0).any(axis=1) | (size != 0).any(axis=1)
-        strength = np.where(moved[:own, None], 0, lights.flux_factor(flux[:own]))
+        strength = lights.staying(turn[:own], flux[:own], size[:own])
         # The last is 1, for texels of no light.
         self.strength = flat(mi.Float, np.concatenate([strength, np.ones((1, 3))]).astype(np.float32))
         self.cores = SourceCores(layers, grid, self.edge)
         self.moved = MovedLights(layers, grid.shape, turn, flux, size)
-        self._leaving = np.flatnonzero(moved[:own])
+        self._leaving = np.flatnonzero((turn[:own] != 0).any(axis=1) | (size[:own] != 0).any(axis=1))
 
     def collect(self, source):
         """Gather the texels of lights that move, and place them."""
@@ -123,7 +122,7 @@ class _LayersAt:
             if not self.cores.any(band):
                 continue
             directions = self.cores.directions(band)
-            light, share, core = self.cores.of(band, band.colours(source[band.rows]), directions)
+            light, share, core, _ = self.cores.of(band, band.colours(source[band.rows]), directions)
             light, share = (v.numpy().reshape(band.shape) for v in (light, share))
             core = band.image(core).numpy()
             light[: band.fresh - band.start] = -1
@@ -148,10 +147,11 @@ class _LayersAt:
         base = image
         core = None
         if self.cores.any(band):
-            light, _, own_core = self.cores.of(band, image, directions)
-            base = image - own_core
+            light, _, own_core, hidden = self.cores.of(band, image, directions)
             which = dr.select(light < 0, dr.opaque(mi.Int32, self.layers.lights.own), light)
             strength = dr.gather(mi.Color3f, self.strength, mi.UInt32(which))
+            uncovered = hidden * dr.maximum(1 - mi.luminance(strength), 0)
+            base = image - own_core + uncovered
             core = own_core * strength
 
         # ---- The sky
@@ -159,7 +159,7 @@ class _LayersAt:
         same = sky == base
         if core is not None:
             sky += core
-            same &= (strength == 1) | (own_core == 0)
+            same &= ((strength == 1) | (own_core == 0)) & (uncovered == 0)
         sky = dr.select(same, image, sky)
 
         # ---- Lights that have moved or were added: none shines from rows that follow

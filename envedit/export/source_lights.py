@@ -25,6 +25,8 @@ from envedit.representations.layers.separation import grown
 
 NARROWEST = 0.6
 """Least radius of an added light in texels: one that is narrower would vanish between them."""
+LEAST_LUMINANCE = 1e-30
+"""Least luminance of a texel that its core's is divided by. Derived: finite where both are 0."""
 REACH = 6.0
 """Radii at which an added light ends, at 1e-8 of its peak."""
 
@@ -73,8 +75,10 @@ class SourceCores:
         near = self.surveyed.row[[band.start, band.stop - 1]]
         return bool((self.label[near[0] : near[1] + 1] >= 0).any())
 
-    def of(self, band: Band, image: mi.Color3f, d: mi.Vector3f) -> tuple[mi.Int32, mi.Float, mi.Color3f]:
-        """Return of a band's texels at directions ``d``: light, or -1; how far inside it, 0 to 1; core."""
+    def of(
+        self, band: Band, image: mi.Color3f, d: mi.Vector3f
+    ) -> tuple[mi.Int32, mi.Float, mi.Color3f, mi.Color3f]:
+        """Return of texels of a band at directions ``d``: light or -1, share in it, core, what it hides."""
         at = self.surveyed
         label = self.label[at.row[band.rows]].astype(np.int32)
         light = at.nearest(mi.Int32, band, flat(mi.Int32, label))
@@ -83,8 +87,10 @@ class SourceCores:
         if self.lights.glowing:
             below *= self.lights.glow_before(d)
         light = dr.select(self.follow(band), -1, light)
-        core = dr.select(light >= 0, dr.maximum(image - below, 0) * (1 - outside), 0)
-        return light, inside, core
+        above_sky = dr.select(light >= 0, (image - below) * (1 - outside), 0)
+        core = dr.maximum(above_sky, 0)
+        of_core = mi.luminance(core) / dr.maximum(mi.luminance(image), LEAST_LUMINANCE)
+        return light, inside, core, of_core * dr.maximum(-above_sky, 0)
 
 
 # ---- Lights that have moved or were added ------------------------------------------------------------------

@@ -90,6 +90,31 @@ def test_no_edit_is_the_source_bit_for_bit(sunny, band, monkeypatch):
     assert carried(made, params, working, source)[0].tobytes() == source.tobytes()
 
 
+def test_a_red_sun_leaves_no_stain_in_the_sky_and_stays_red():
+    source = sky(256, 512, glow=False)
+    sun = near(source.shape[:2], toward(25, 200), 1.0)
+    source[sun] = [6500, 1000, 0]
+    working = small(source)
+    made, params = encoded(working)
+    assert len(made.separation.lights) == 1 and made.separation.hidden.any()
+    np.testing.assert_array_equal(carried(made, params, working, source)[0], source)
+
+    # ---- Where it was, all channels are those of the sky around, at both resolutions
+    result, edited = carried(made, sent(made, params, toward(60, 60)), working, source)
+    for image in (result, edited):
+        shape = image.shape[:2]
+        around = near(shape, toward(25, 200), 12) & ~near(shape, toward(25, 200), 6)
+        covered = near(shape, toward(25, 200), 2)
+        np.testing.assert_allclose(image[covered].mean(axis=0), image[around].mean(axis=0), rtol=0.15)
+        assert (image[covered] > 0.5 * np.median(image[around], axis=0)).all()
+
+    # ---- Dimmed to half where it is, half of what it hides comes back
+    half = {name: value.copy() for name, value in params.items()}
+    half["flux"][0] = np.log(0.5) / layers.SCALES["flux"]
+    dimmed, _ = carried(made, half, working, source)
+    np.testing.assert_allclose(dimmed[sun][:, 2], 0.5 * result[sun][:, 2], rtol=0.01)
+
+
 @pytest.mark.slow
 def test_bands_do_not_show(sunny, rng, monkeypatch):
     source, working, made, params = sunny

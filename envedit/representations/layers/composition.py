@@ -2,12 +2,12 @@
 
     E = sat_k(E_0' * prod((1 + f_l G_l) / (1 + G_l^0)) * exp(w r)) * exp(g) + sum(C_l)
 
-E_0' is the original without the cores C_l of its lights. The first factor is how the glow of the lights has
-changed (``aureoles.py``), exp(w r) what is seen where a glow has gone (``behind_glow.py``), k the saturation
-of the sky's colours (``saturation.py``) and g its smooth gain (``gain.py``). Where the first factor p is
-above 1, it is 1 + (p - 1) min(1, exp(lum r)): a glow adds to a cloud no more than to the sky that is seen at
-its elevation. In rows below the horizon that follow those above, one factor stands for the first two
-(``below_horizon.py``).
+E_0' is the original without the cores C_l of its lights, and with what they hid where they have gone
+(``separation.py``). The first factor is how the glow of the lights has changed (``aureoles.py``), exp(w r)
+what is seen where a glow has gone (``behind_glow.py``), k the saturation of the sky's colours
+(``saturation.py``) and g its smooth gain (``gain.py``). Where the first factor p is above 1, it is
+1 + (p - 1) min(1, exp(lum r)): a glow adds to a cloud no more than to the sky that is seen at its elevation.
+In rows below the horizon that follow those above, one factor stands for the first two (``below_horizon.py``).
 
 :class:`.Layers` composes the working map, :mod:`.full_resolution` the map of the input's file: they differ in
 where these fields come from, and in how the cores are rendered, which are added to what :func:`compose`

@@ -20,7 +20,7 @@ import mitsuba as mi
 import numpy as np
 
 from envedit.core import latlong
-from envedit.core.arrays import tensor, vectors
+from envedit.core.arrays import flat, tensor, vectors
 from envedit.core.color import LUMINANCE
 from envedit.core.radiance import BRIGHTEST, require_radiance
 from envedit.core.rotations import rotated
@@ -30,7 +30,7 @@ from envedit.representations.layers.below_horizon import Below, Horizon, sky_row
 from envedit.representations.layers.composition import Fields, Glows, compose
 from envedit.representations.layers.gain import CYCLES, GridGain, Octave
 from envedit.representations.layers.ground_light import GroundLight
-from envedit.representations.layers.lights import DARK, SPARE, Lights, flux_factor
+from envedit.representations.layers.lights import DARK, SPARE, Lights, flux_factor, staying
 from envedit.representations.layers.saturation import saturated
 from envedit.representations.layers.separation import MOVABLE, Separation, separate
 
@@ -64,6 +64,9 @@ class _Texels(NamedTuple):
 
     directions: mi.Vector3f
     base: mi.Color3f
+    # What each light hides, :attr:`.Separation.hidden`; and which light, an index, a texel is of
+    hidden: mi.Color3f
+    light: mi.UInt32
     fields: Fields
 
 
@@ -245,7 +248,14 @@ class Layers:
 
     def _above(self, real, fields=None):
         """Compose the rows above the horizon, by default with the fields of the parameters."""
-        return compose(self._texels.base, self._texels.directions, fields or self._fields(real))
+        texels = self._texels
+        base = texels.base
+        if self.separation.hidden.any():
+            own = slice(self.lights.own)
+            left = staying(*(dr.detach(real[name]).numpy()[own] for name in ("turn", "flux", "size")))
+            uncovered = flat(mi.Float, np.maximum(1 - left @ LUMINANCE, 0).astype(np.float32))
+            base = base + texels.hidden * dr.gather(mi.Float, uncovered, texels.light)
+        return compose(base, texels.directions, fields or self._fields(real))
 
     def _fields(self, real):
         """Return what parameters do to the rows above the horizon."""
@@ -300,7 +310,19 @@ class Layers:
             )
         free = None if self.free is None else dr.opaque(mi.Float(np.float32(self.free.ravel())))
         kept = None if self.kept is None else dr.opaque(mi.Float(self.kept[:height].ravel()))
-        return _Texels(directions, vectors(mi.Color3f, self.base), Fields(glows=glows, share=free, kept=kept))
+        hidden = self.separation.hidden
+        if self.kept is not None:
+            hidden = hidden * (1 - self.kept[:height, :, None])
+        light = np.zeros(height * width, np.uint32)
+        for i, one in enumerate(self.separation.lights):
+            light[one.texels] = i
+        return _Texels(
+            directions=directions,
+            base=vectors(mi.Color3f, self.base),
+            hidden=vectors(mi.Color3f, hidden),
+            light=dr.opaque(mi.UInt32(light)),
+            fields=Fields(glows=glows, share=free, kept=kept),
+        )
 
     @functools.cached_property
     def _grids(self):

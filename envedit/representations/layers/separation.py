@@ -4,7 +4,9 @@ A map is separated as E = B * prod(1 + G_l) + sum(C_l). The **core** C_l of a li
 stands out: a sun's disc, a lamp, a softbox. Its **glow** G_l is what the light does to the sky around it, as
 a factor, beside sky of the same elevation elsewhere, that falls with the angle to the light: when the sun
 moves, the clouds stay and their lighting changes. What is left is the background B, the map as it would be
-without its lights.
+without its lights. A light covers the sky: where a channel of its texels has less than the sky around it, as
+the blue of a red sun, the map is darker than the formula by what is **hidden**, as far as the texel's light
+is the core's.
 
 All steps are in angles and shares of the light, not in texels or radiance: they mean the same for a map of
 any resolution and exposure.
@@ -85,12 +87,14 @@ class Light:
 
 @dataclass(frozen=True)
 class Separation:
-    """A separated map; ``background * glow + core`` is the map to float precision."""
+    """A separated map; ``background * glow + core - hidden`` is the map to float precision."""
 
-    # background, glow, core: (rows, W, 3): B, the product of 1 + G over all lights, and the sum of all cores
+    # background, glow, core, hidden: (rows, W, 3): B, the product of 1 + G over all lights, the sum of all
+    # cores, and what these hide
     background: np.ndarray
     glow: np.ndarray
     core: np.ndarray
+    hidden: np.ndarray
     lights: list[Light] = field(default_factory=list)  # those with most flux first
     # Where the lights were found, to find the same lights in another resolution of the map; None without
     survey: Survey | None = None
@@ -154,7 +158,8 @@ def separate(
     if survey is None:
         survey = survey_of(image, rows, most)
     if survey is None:
-        return Separation(image, np.ones_like(image), np.zeros_like(image), [])
+        nothing = np.zeros_like(image)
+        return Separation(image, np.ones_like(image), nothing, nothing, [])
 
     # ---- Glow, cores and background at the map's own resolution
     row, column = _places(survey, (height, width), (first, total))
@@ -164,8 +169,11 @@ def separate(
     below = survey.below
     if below.shape[:2] != (height, width):
         below = resampling.bilinear(below, row[:, None], column, around=True)
-    core = np.where(inside, np.maximum(image - below * glow, 0), 0)
-    background = np.where(inside, (image - core) / glow, image / glow)
+    above_sky = np.where(inside, image - below * glow, 0)
+    core = np.maximum(above_sky, 0)
+    of_core = core @ LUMINANCE / np.maximum(image @ LUMINANCE, 1e-300)
+    hidden = of_core[..., None] * np.maximum(-above_sky, 0)
+    background = (image - core + hidden) / glow
 
     # ---- Lights; those that leave nothing at this resolution are dropped
     shining = (core > 0).any(axis=2)
@@ -178,7 +186,7 @@ def separate(
     radiance = [core.reshape(-1, 3)[texels[i]] for i in kept]
     lights = [Light(centres[k], texels[i], radiance[k], glows[k]) for k, i in enumerate(kept)]
     survey = replace(survey, label=number[survey.label], centres=centres, glows=glows)
-    return Separation(background, glow, core, lights, survey)
+    return Separation(background, glow, core, hidden, lights, survey)
 
 
 def glow_of(survey: Survey, directions: np.ndarray) -> np.ndarray:

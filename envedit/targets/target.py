@@ -84,15 +84,8 @@ class Target:
         return replace(self, picture=picture) if self.compared is None else replace(self, compared=picture)
 
     def seen_as(self, seen: np.ndarray, rendering: np.ndarray) -> Target:
-        """Return the target as T sees it: without what T, ``seen``, misses of a map's rendering, (h, w, 3).
-
-        What is asked for beside the rendering is asked for beside T's: more light as a sum, less as a factor,
-        so that nothing falls below black. Nothing is spent on the noise of both.
-        """
-        less = np.minimum(self.picture, rendering)
-        more = self.picture - less
-        factor = np.divide(less, rendering, out=np.ones_like(less), where=rendering > 0)
-        return replace(self, compared=(factor * seen + more).astype(np.float32))
+        """Return the target as T sees it (:func:`beside`), ``seen`` of a map's ``rendering`` (h, w, 3)."""
+        return replace(self, compared=beside(seen, rendering, self.picture))
 
     def developed(self, photograph: photographs.Photo) -> Target:
         """Return the target with its photograph, whose camera and place are known better."""
@@ -110,6 +103,17 @@ class Target:
         assert self.coverage is not None, "nothing was painted"
         uncounted = self.weight[..., 0] == 0
         return replace(self, weight=pixel_weight(self.coverage, uncounted, paint, hold))
+
+
+def beside(seen: np.ndarray, rendering: np.ndarray, picture: np.ndarray) -> np.ndarray:
+    """Return a picture as T sees it: without what T, ``seen``, misses of a map's rendering; (h, w, 3) all.
+
+    What is asked for beside the rendering is asked for beside T's: more light as a sum, less as a factor, so
+    that nothing falls below black. Nothing is spent on the noise of both.
+    """
+    less = np.minimum(picture, rendering)
+    factor = np.divide(less, rendering, out=np.ones_like(less), where=rendering > 0)
+    return (factor * seen + picture - less).astype(np.float32)
 
 
 def make(

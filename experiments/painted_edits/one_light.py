@@ -20,6 +20,7 @@ from envedit.representations.layers.separation import separate
 from envedit.solve.likelihood import STATEMENTS, Likelihood
 from envedit.solve.prior import PHOTOGRAPHED
 from envedit.targets.pixel_weights import FOLLOWING, hidden_pixels, pixel_weight
+from envedit.targets.target import beside
 from experiments.painted_edits.painters import Paint, View
 
 ERROR = 1 / 3
@@ -70,7 +71,7 @@ def share(settings, view: View, initial: np.ndarray, paint: Paint) -> float:
     comparison = _Comparison(
         parts=np.stack([overview.to_blocks(picture) for picture in pictures]),
         other=overview.to_blocks(other),
-        aim=overview.to_blocks(paint.picture - initial + pictures.sum(axis=0) + other).clip(0),
+        aim=overview.to_blocks(beside(pictures.sum(axis=0) + other, initial, paint.picture)),
         precision=painted / (ERROR * likelihood.paint_noise) ** 2,
         rest=overview.to_blocks(likelihood.share)[:, 0] * size,
         white=likelihood.white,

@@ -53,7 +53,13 @@ def patch(rng, top, left, rows=3, columns=4, *, shape=(H, W), peak=100.0, glow=N
     radiance = peak * rng.uniform(0.2, 1.0, (len(r), 3))
     flux = radiance.sum(axis=1) * latlong.lookup_solid_angles(*shape)[r]
     centre = (latlong.directions(*shape)[r, c] * flux[:, None]).sum(axis=0)
-    return Light(centre / np.linalg.norm(centre), r * width + c, radiance, glow)
+    return Light(
+        direction=centre / np.linalg.norm(centre),
+        texels=r * width + c,
+        radiance=radiance,
+        hidden=np.zeros_like(radiance),
+        glow=glow,
+    )
 
 
 def image_of(light, shape=(H, W)):

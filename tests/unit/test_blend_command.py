@@ -62,6 +62,13 @@ def test_a_light_without_a_partner_fades_where_it_is():
     np.testing.assert_allclose(after["direction"], before["direction"], atol=0.02)
 
 
+def test_a_red_sun_that_moves_leaves_no_stain():
+    first, second = sky(None, 0, 0.2), sky(None, 0, 0.2)
+    first[12, 30] = second[25, 70] = [6500, 1000, 0]
+    mixed, _ = blended.blend(first, second, 0.5)
+    np.testing.assert_allclose(mixed[[12, 25], [30, 70]], 0.2, rtol=1e-3)
+
+
 @pytest.mark.parametrize("level", [0.0, 1e-30, 1e6])
 def test_black_and_bright_maps_stay_finite(level):
     mixed, _ = blended.blend(sky((12, 30), 20000, 0.2), sky(None, 0, level), 0.5)

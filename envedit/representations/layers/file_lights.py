@@ -43,6 +43,7 @@ def lights_of(radiance: np.ndarray) -> list[Light]:
             part[0],
             texels=np.concatenate([light.texels for light in part]),
             radiance=np.concatenate([light.radiance for light in part]),
+            hidden=np.concatenate([light.hidden for light in part]),
         )
         for part in parts
         if part
@@ -50,10 +51,10 @@ def lights_of(radiance: np.ndarray) -> list[Light]:
 
 
 def take_out(radiance: np.ndarray, lights: list[Light]) -> None:
-    """Take lights out of a map (H, W, 3) float32 in place; what is left is not negative."""
+    """Take lights out of a map (H, W, 3) float32 in place; what is left is the sky, not negative."""
     for light in lights:
         texels = np.divmod(light.texels, radiance.shape[1])  # of a map in any memory layout
-        radiance[texels] = np.maximum(radiance[texels] - light.radiance, 0)
+        radiance[texels] = np.maximum(radiance[texels] - light.radiance + light.hidden, 0)
 
 
 def without(radiance: np.ndarray, lights: list[Light]) -> np.ndarray:

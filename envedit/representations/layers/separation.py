@@ -80,7 +80,9 @@ class Light:
 
     direction: np.ndarray  # (3,), unit vector to the centre of its flux, in the emitter's frame
     texels: np.ndarray  # (n,), its texels, row * W + column
-    radiance: np.ndarray  # (n, 3), radiance of the core in them
+    # radiance, hidden: (n, 3), radiance of the core in them, and of the sky that it hides
+    radiance: np.ndarray
+    hidden: np.ndarray
     # (len(GLOW_DEGREES), 3), factor by which it brightens the sky, less 1, at these angles from its centre
     glow: np.ndarray | None
 
@@ -183,8 +185,16 @@ def separate(
     number[kept] = np.arange(len(kept))
     centres = [survey.centres[i] for i in kept]
     glows = [survey.glows[i] for i in kept]
-    radiance = [core.reshape(-1, 3)[texels[i]] for i in kept]
-    lights = [Light(centres[k], texels[i], radiance[k], glows[k]) for k, i in enumerate(kept)]
+    lights = [
+        Light(
+            direction=survey.centres[i],
+            texels=texels[i],
+            radiance=core.reshape(-1, 3)[texels[i]],
+            hidden=hidden.reshape(-1, 3)[texels[i]],
+            glow=survey.glows[i],
+        )
+        for i in kept
+    ]
     survey = replace(survey, label=number[survey.label], centres=centres, glows=glows)
     return Separation(background, glow, core, hidden, lights, survey)
 

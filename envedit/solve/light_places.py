@@ -174,7 +174,7 @@ class Places:
         normal, cells = self.normal, self._cells
         columns = zip(normal.linear.jacobian, normal.squared.T, flux, strict=True)
         mixed: list[Any] = [*cells.products([j * (f * w)[:, None] for j, w, f in columns])]
-        if normal.lights:
+        if len(normal.linear.pictures):
             mixed.append(sum(cells.products([b * f for b, f in zip(normal.lights, flux, strict=True)])))
         pull: Any = sum(cells.products(list((normal.pulled * flux).T[..., None])))
         power = cells.power(normal.squared * flux**2).sum(axis=0)
@@ -208,8 +208,7 @@ class Places:
         With the derivatives by the unknowns (m, n), with the residual and with themselves, (n,) both; and
         what they do to the mean of what was not painted, (3, n).
         """
-        normal, count = self.normal, len(pictures)
-        linear = normal.linear
+        normal, linear = self.normal, self.normal.linear
         known = linear.pictures.reshape(len(linear.pictures), pictures.shape[1], 3)
         mixed: list[np.ndarray] = []
         by_pictures: Any = 0.0
@@ -223,7 +222,7 @@ class Places:
             )
             weighted = mine * np.float32(slope**2 * robust)
             mixed.append(j.T @ self.problem.blocks.sums(weighted * profile).T)
-            by_pictures = by_pictures + known[..., c] @ weighted.T if len(known) else np.zeros((0, count))
+            by_pictures = by_pictures + known[..., c] @ weighted.T
             pull = pull + mine @ (slope * robust * residual)
             power = power + np.einsum("np,np->n", mine, weighted)
         by_pixels = normal.mean_by_pixels.reshape(-1, 3)

@@ -238,32 +238,30 @@ class Problem(Unknowns):
         share, mean = self.likelihood.linear_mean(point.residual)
         slope = self._slope(point)
 
-        # ---- Gain, by blocks
-        squared = blocks.summed((slope * profile) ** 2 * robust)
-        pulled = blocks.summed(slope * profile * robust * point.residual)
-        mean_by_blocks = blocks.summed(slope * profile * share)
+        # ---- Lights and saturation, by pixels
+        rest = slice(3 * n, unknowns)
+        flat = (pictures * (slope * np.sqrt(robust))).reshape(len(pictures), slope.size)
+        hessian[rest, rest] = flat @ flat.T
+        gradient[rest] = flat @ (np.sqrt(robust) * point.residual).ravel()
+        mean_by_unknowns[:, rest] = np.einsum("khwc,hwc->ck", pictures, slope * share)
+        gradient[rest] += mean @ mean_by_unknowns[:, rest]
+
+        # ---- Gain, and what it has in common with lights, by blocks
+        of_gain = slope * profile
+        squared = blocks.summed(of_gain**2 * robust)
+        pulled = blocks.summed(of_gain * robust * point.residual)
+        mean_by_blocks = blocks.summed(of_gain * share)
+        lights_in_blocks = []
         for c, j in enumerate(linear.jacobian):
             part = slice(c * n, (c + 1) * n)
             scaled = tensor(j * np.sqrt(squared[:, c : c + 1]))
             hessian[part, part] = dr.matmul(scaled, scaled, At=True).numpy()
+            weighted = pictures[..., c] * (slope**2 * profile * robust)[..., c]
+            in_blocks = blocks.sums(weighted.reshape(len(pictures), robust.size)).T
+            hessian[rest, part] = in_blocks.T @ j
+            hessian[part, rest] = hessian[rest, part].T
             mean_by_unknowns[c, part] = mean_by_blocks[:, c] @ j
-
-        # ---- Lights and saturation, by pixels; with the gain, by blocks
-        lights_in_blocks = []
-        if len(pictures):
-            rest = slice(3 * n, unknowns)
-            flat = (pictures * (slope * np.sqrt(robust))).reshape(len(pictures), -1)
-            hessian[rest, rest] = flat @ flat.T
-            gradient[rest] = flat @ (np.sqrt(robust) * point.residual).ravel()
-            mean_by_unknowns[:, rest] = np.einsum("khwc,hwc->ck", pictures, slope * share)
-            gradient[rest] += mean @ mean_by_unknowns[:, rest]
-            for c, j in enumerate(linear.jacobian):
-                part = slice(c * n, (c + 1) * n)
-                weighted = pictures[..., c] * (slope**2 * profile * robust)[..., c]
-                in_blocks = blocks.sums(weighted.reshape(len(weighted), -1)).T
-                hessian[rest, part] = in_blocks.T @ j
-                hessian[part, rest] = hessian[rest, part].T
-                lights_in_blocks.append(in_blocks)
+            lights_in_blocks.append(in_blocks)
 
         # ---- The gradient by gain and saturation, through T
         if descent:

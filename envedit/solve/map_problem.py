@@ -205,8 +205,10 @@ class Problem(Unknowns):
     def from_start(self, state: dict, start: dict) -> float:
         """Return x' K x."""
         unknowns = self.named(state)
-        change = self._from_prior(state, start, unknowns)
-        return float(change @ self._precision(unknowns) @ change)
+        rest = self._from_prior(state, start, unknowns)[3 * self.nodes :]
+        total = rest @ self._precision_beside_gain(unknowns) @ rest
+        along = AXES @ state["gain"].T  # a third of the products that channels take
+        return float(total + sum(g @ k @ g for g, k in zip(along, self._precisions, strict=True)))
 
     # ---- normal equations ----------------------------------------------------------------------------------
 
@@ -330,11 +332,16 @@ class Problem(Unknowns):
         return np.concatenate([one.reshape(-1, 3) for one in derivatives]), colour
 
     def _precision(self, unknowns):
-        """Return K: of the gain diagonal in luminance, chroma and tint, of lights by their kinds."""
-        n = self.nodes
-        precision = np.zeros((3 * n + len(unknowns),) * 2)
-        precision[: 3 * n, : 3 * n] = self._gain_precision
-        for k, (name, i, axis) in enumerate(unknowns, 3 * n):
+        """Return K of the gain, channel by channel, and of the unknowns beside it."""
+        gain = 3 * self.nodes
+        precision = np.zeros((gain + len(unknowns),) * 2)
+        precision[:gain, :gain] = self._gain_precision
+        precision[gain:, gain:] = self._precision_beside_gain(unknowns)
+        return precision
+
+    def _precision_beside_gain(self, unknowns):
+        precision = np.zeros((len(unknowns),) * 2)
+        for k, (name, i, axis) in enumerate(unknowns):
             if name == "flux":
                 precision[k, k - axis : k - axis + 3] = self.prior.flux_precision[axis]
             elif name == "camera":

@@ -168,8 +168,10 @@ class LayersSolver:
         """Return the run that goes on from a solution; None where it is the last."""
         if self.edit.target.painted:
             return self._held_more(solution.run)
+        if not self._goes_on(solution):
+            return None
         photo = self.edit.target.photo
-        if photo is not None and not photo.settled and self._goes_on(solution):
+        if photo is not None and not photo.settled:
             run, self._curves = photograph.settled(self.edit, solution.run)
             if run is not None:
                 return run
@@ -211,10 +213,8 @@ class LayersSolver:
         return replace(likelier.run, most=len(likelier.run.history) + gauss_newton.MOST_STEPS)
 
     def _corrected(self, solution):
-        """Return a run that goes on towards the target without T's error; None where it need not."""
+        """Return a run that goes on towards the target without T's error."""
         edit, run = self.edit, solution.run
-        if not self._goes_on(solution):
-            return None
         point = gauss_newton.reached(edit.problem(), run)
         edit.target = edit.target.seen_as(point.rendering, self._path_traced(point.edited))
         most = len(run.history) + CORRECTED_STEPS

@@ -291,13 +291,12 @@ def _beside_the_sky(problem, best):
             yield _Move(k, MOVED, moved, centre, gain=there.promise - stays)
 
     # ---- one more
-    spare = [k for k in range(lights.own, lights.count) if k not in problem.added(state)]
-    for k in spare[:1]:
-        places = _places(problem, state, start, transport)
-        for there in places.best(k) if places else []:
-            turn, flux = rotation_vector(lights.centres[k], there.direction), there.log_flux
-            more, centre = (with_light(one, k, turn=turn, flux=flux, size=0.0) for one in (state, start))
-            yield _Move(k, ADDED, more, centre, gain=there.promise - ADDED_LIGHT_COST)
+    spare = problem.spare(state)
+    places = None if spare is None else _places(problem, state, start, transport)
+    for there in places.best(spare) if places else []:
+        turn, flux = rotation_vector(lights.centres[spare], there.direction), there.log_flux
+        more, centre = (with_light(one, spare, turn=turn, flux=flux, size=0.0) for one in (state, start))
+        yield _Move(spare, ADDED, more, centre, gain=there.promise - ADDED_LIGHT_COST)
 
 
 def _places(problem, state, start, transport):
@@ -316,7 +315,7 @@ def _under_the_original(problem, best):
     """Yield moves that raise the likelihood under the gain of the original, all else as it is."""
     state, start = _under_original_sky(best.run.state), best.run.start
     lights, transport = problem.layers.lights, best.point.transport
-    spare = [k for k in range(lights.own, lights.count) if k not in problem.added(state)]
+    spare = problem.spare(state)
     now = _unlikeliness(problem, state, transport)
 
     for k in problem.shining(state):
@@ -330,12 +329,12 @@ def _under_the_original(problem, best):
             centre = with_light(start, k, turn=moved["turn"][k]) if own else _put(lights, start, k, there)
             yield _Move(k, MOVED, moved, centre, gain=now + there.promise - cost)
         # ---- softer: a light of few texels cannot grow, as its texels would part; a lobe can
-        if own and spare:
-            flux = state["flux"][k] + log_flux_of(lights.flux[k] / lights.flux[spare[0]])
-            turn = rotation_vector(lights.centres[spare[0]], away)
+        if own and spare is not None:
+            flux = state["flux"][k] + log_flux_of(lights.flux[k] / lights.flux[spare])
+            turn = rotation_vector(lights.centres[spare], away)
             size = lights.log_size(painted_places.LARGER_DEGREES[0])
-            soft = with_light(dark, spare[0], turn=turn, flux=flux, size=size)
-            centre = with_light(start, spare[0], turn=turn, flux=flux, size=size)
+            soft = with_light(dark, spare, turn=turn, flux=flux, size=size)
+            centre = with_light(start, spare, turn=turn, flux=flux, size=size)
             yield _Move(k, SOFTENED, soft, centre, gain=now - _unlikeliness(problem, soft, transport))
         # ---- out, if it was added
         if not own:
@@ -343,10 +342,9 @@ def _under_the_original(problem, best):
             yield _Move(k, REMOVED, dark, start, gain)
 
     # ---- one more, as large as it must be
-    for k in spare[:1]:
-        for there in painted_places.best(problem, state, transport, k):
-            more, centre = (_put(lights, one, k, there) for one in (state, start))
-            yield _Move(k, ADDED, more, centre, gain=now + there.promise - ADDED_LIGHT_COST)
+    for there in () if spare is None else painted_places.best(problem, state, transport, spare):
+        more, centre = (_put(lights, one, spare, there) for one in (state, start))
+        yield _Move(spare, ADDED, more, centre, gain=now + there.promise - ADDED_LIGHT_COST)
 
 
 def _under_original_sky(state):

@@ -155,6 +155,11 @@ class Unknowns:
         """List the added lights that shine: spare ones whose flux is not 0."""
         return [i for i in self.shining(state) if i >= self.layers.lights.own]
 
+    def spare(self, state: dict) -> int | None:
+        """Return the first light that is not the map's and does not shine; None where all do."""
+        lights, added = self.layers.lights, self.added(state)
+        return next((i for i in range(lights.own, lights.count) if i not in added), None)
+
     def shining(self, state: dict) -> list[int]:
         """List the lights whose flux is not 0."""
         return [i for i, flux in enumerate(state["flux"]) if flux.max() > DARK + 1]

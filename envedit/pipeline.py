@@ -241,12 +241,12 @@ class _Edit:
         if transport and target.painted:
             rendering = transport.resolved(self.original).apply(mi.TensorXf(self.original)).numpy()
             target = target.seen_as(rendering, target.initial)
-        self.prepared = preparation.edit(target)
-        self.job = self.prepared.job
-        self.degrees = self.prepared.degrees
-        self.frozen = self.prepared.frozen
+        self.solver = preparation.edit(target)
+        self.job = self.solver.edit
+        self.degrees = self.job.degrees
+        self.frozen = self.job.frozen
         self.transport = self.job.renderer.transport
-        self.notes += [*self.job.renderer.choices, *self.prepared.notes]
+        self.notes += [*self.job.renderer.choices, *self.job.notes]
 
     def _traced(self):
         return Preparation(
@@ -267,7 +267,10 @@ class _Edit:
         self.warnings += config.unused(self.settings, None if no_step else solver)
         with self.clock("edit_s"):
             self.watch.stage("editing")
-            self.params, self.state = self.prepared.optimise(resume)
+            if self.job.newton:
+                self.params, self.state = self.solver.optimise(resume)
+            else:
+                self.params, self.state = adam_solver.optimise(self.job, self.solver.params, resume)
             self.transport = self.job.renderer.transport
             self.edited = self.solved_map = self.job.decode(self.params)
         photo = self.target.photo
@@ -379,10 +382,10 @@ class _Edit:
         """Render the other explanations of paint, and measure how far they follow it."""
         target, tonemap = self.target, self.settings.output.tonemap
         seen = None if self.scene.alpha is None else self.scene.alpha > 0
-        for explanation in self.prepared.layers.others if self.job else ():
+        for explanation in self.solver.others if self.job else ():
             with self.clock("judge_s"):
                 self.watch.stage("rendering other explanations")
-                changed, _ = self._adjusted(self.prepared.layers.map_of(explanation))
+                changed, _ = self._adjusted(self.solver.map_of(explanation))
                 render = self.scene.render(changed, variants.SPP, self.seeds.judged)
                 followed = metrics.painted(
                     render, target.picture, target.initial, target.coverage, tonemap, seen
@@ -561,8 +564,8 @@ class _Edit:
         """Return what the run has found."""
         # ---- What is said of the edit
         job, notes = self.job, self.notes
-        if job and self.prepared.layers.note:
-            notes.append(self.prepared.layers.note)
+        if job and self.solver.note:
+            notes.append(self.solver.note)
         if self.others:
             notes.append(f"other explanations: {', '.join(one.summary for one in self.others)}")
         if lights := light_list.summary(self.lights, len(self.original)):
@@ -607,7 +610,7 @@ class _Edit:
             input_map=self.map,
             alpha=self.scene.alpha,
             found=found,
-            posterior=self.prepared.layers.posterior if job else None,
+            posterior=self.solver.posterior if job else None,
             photo=self.target.photo,
             outliers=self.outliers,
             variants=self.others,

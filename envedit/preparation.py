@@ -6,6 +6,7 @@ or a network is fitted, and it is found out where the edit starts.
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -21,7 +22,6 @@ from envedit.core.array_cache import cache_folder
 from envedit.core.errors import NumericalError
 from envedit.core.rows import Rows
 from envedit.core.seeds import Seeds
-from envedit.core.types import Params
 from envedit.images import map_regions
 from envedit.inputs import InputMap
 from envedit.losses.perceptual import distances
@@ -29,7 +29,7 @@ from envedit.representations.layers import below_horizon
 from envedit.representations.siren.siren import Siren
 from envedit.scene.renderings import rendered
 from envedit.scene.scene import Scene
-from envedit.solve import adam_loop, adam_solver, initialization, sky_factor, turning
+from envedit.solve import initialization, sky_factor, turning
 from envedit.solve.edit_state import EditState, Watch
 from envedit.solve.layers_solver import LayersSolver
 from envedit.solve.likelihood import INDEPENDENT, sizes
@@ -42,29 +42,6 @@ target. Between renderings of one map the ratio is 1, with a standard error of 0
 TURN_PATHS = 2**20
 """Paths of a rendering that is compared to find a turn, all pixels together, up to a factor of two; at most
 as many as the target's."""
-
-
-@dataclass(frozen=True)
-class PreparedEdit:
-    """An edit that is ready to be optimised."""
-
-    job: EditState  # has the map, turned, as its original
-    layers: LayersSolver  # solver of layers; finds where Adam starts, if their detail is left to it
-    params: dict  # where it starts
-    degrees: float  # by how much it has been turned
-    # bool (H, W), active texels that keep their value; None where the renderer does not know
-    frozen: np.ndarray | None
-    notes: list[str]  # what was chosen
-
-    def optimise(self, resume: bool) -> tuple[Params, adam_loop.State]:
-        """Optimise from the start, or from the checkpoint; returns parameters and state.
-
-        By Gauss-Newton for layers through T, by Adam for all else; errors are those of
-        :func:`.adam_solver.optimise` and :meth:`.LayersSolver.optimise`.
-        """
-        if self.job.newton:
-            return self.layers.optimise(resume)
-        return adam_solver.optimise(self.job, self.params, resume)
 
 
 @dataclass
@@ -105,15 +82,15 @@ class Preparation:
         with self.clock("transport_s"):
             return bool(self._recorded(representation, target).octaves)
 
-    def edit(self, target: Target) -> PreparedEdit:
+    def edit(self, target: Target) -> LayersSolver:
         """Prepare the edit; the sky is turned where that explains the target better.
 
         One that goes on from a solution on disk is of the map and the layers as they are.
         """
         if self._started_before:
-            edit = self._prepared(target, 0.0, [], search=False)
-            edit.layers.go_on_from(self.settings.optimizer.start)
-            return edit
+            solver = self._prepared(target, 0.0, [], search=False)
+            solver.go_on_from(self.settings.optimizer.start)
+            return solver
         # ---- Maps that explain the target to its noise are taken as they are
         if self._explains(self.original, target):
             note = "nothing changed: the map already renders to the target within noise"
@@ -131,17 +108,17 @@ class Preparation:
         if not always and turn.left >= turning.EXPLAINED:
             return self._prepared(target, 0.0, [])
         turned = self._prepared(target, turn.degrees, [note])
-        if always or turned.layers.begun is None:
+        if always or turned.begun is None:
             return turned
         still = self._prepared(target, 0.0, [])
         with self.clock("start_s"):
             self.watch.stage("comparing the edits of the turned and of the unturned sky")
-            score, other = (one.layers.settle() for one in (turned, still))
+            score, other = (one.settle() for one in (turned, still))
         # The map has as many turns as columns, each of which could have been the best: the mean likelihood
         # of all counts.
         score += 2 * np.log(self.original.shape[1] / turn.alike)
         chosen = still if other < score - STRONG_EVIDENCE else turned
-        chosen.notes.append(
+        chosen.edit.notes.append(
             f"-2 log evidence (lower is likelier): {score:.5g} with the sky turned, {other:.5g} without"
         )
         return chosen
@@ -211,7 +188,7 @@ class Preparation:
 
     def _prepared(self, target, degrees, notes, search=True):
         """Prepare the edit of the turned map; ``search``: for lights, and for how fine its gain may be."""
-        settings, rows, notes = self.settings, self.rows.slice, list(notes)
+        settings, rows = self.settings, self.rows.slice
         original = latlong.rotate(self.original, degrees)
         crop = original[rows]
 
@@ -237,24 +214,25 @@ class Preparation:
             folder=self.folder,
             watch=self.watch,
             dists=self.dists,
+            degrees=degrees,
+            notes=notes,
         )
-        layers = LayersSolver(job, params)
+        solver = LayersSolver(job, params)
 
         # ---- Which lights, and where; which pixels count, and whether coarse grids are not enough
         if recordings and (settings.optimizer.iterations or not job.newton):
             with self.clock("start_s"):
-                params, run = self._explained(layers, octaves, notes, recordings.transport)
-            layers.params = params
+                run = self._explained(solver, octaves, recordings.transport)
             if octaves:
-                octaves = self._finer(job, params, recordings, notes)
-                layers.coarse = not octaves
+                octaves = self._finer(solver, recordings)
+                solver.coarse = not octaves
             if job.newton and not octaves:
-                layers.begun = run
+                solver.begun = run
 
         # ---- Which texels keep their value
-        frozen = self._frozen(determined=bool(octaves) or not job.newton)
-        if frozen is not None and frozen.any():
-            job.free = ~frozen[rows]
+        job.frozen = self._frozen(determined=bool(octaves) or not job.newton)
+        if job.frozen is not None and job.frozen.any():
+            job.free = ~job.frozen[rows]
         if self.map.kept is not None and kind != "layers":  # which know it themselves
             open_texels = self.map.kept[rows] < map_regions.KEPT_SHARE
             job.free = open_texels if job.free is None else job.free & open_texels
@@ -270,18 +248,19 @@ class Preparation:
             notes += recordings.notes
         if octaves:
             job.representation = job.representation.refined(octaves)
-            params = job.representation.start() | params
-        return PreparedEdit(job, layers, params, degrees, frozen, notes)
+            solver.params = job.representation.start() | solver.params
+        return solver
 
-    def _finer(self, job, params, recordings, notes):
+    def _finer(self, solver, recordings):
         """Return the octaves of finer grids that are needed; pixels that do not count for them weigh less."""
+        job = solver.edit
         envmap = job.original.copy()
-        envmap[job.rows.slice] = job.representation.decode(params).numpy()
+        envmap[job.rows.slice] = job.representation.decode(solver.params).numpy()
         if self._explains(envmap, job.target):
-            notes.append("coarse grids explain the target to its noise: no finer ones are solved for")
+            job.notes.append("coarse grids explain the target to its noise: no finer ones are solved for")
             return []
-        job.target, more = initialization.trusted(envmap, recordings, job.target)
-        notes += more
+        job.target, notes = initialization.trusted(envmap, recordings, job.target)
+        job.notes += notes
         return recordings.octaves
 
     def _frozen(self, determined: bool) -> np.ndarray | None:
@@ -329,23 +308,22 @@ class Preparation:
             None if self.map.kept is None else self.map.kept[self.rows.slice],
         )
 
-    def _explained(self, layers, octaves, notes, transport):
-        """Find the lights that explain the target, and for Adam the sky; returns parameters and the run."""
+    def _explained(self, solver, octaves, transport):
+        """Find the lights that explain the target, and for Adam the sky; returns the run that leads there."""
         self.watch.stage("searching for lights")
-        explanation = layers.explain(transport)
-        subject = "the paint" if layers.edit.target.painted else "the target"
+        explanation = solver.explain(transport)
+        edit = solver.edit
+        subject = "the paint" if edit.target.painted else "the target"
         evidence = f"-2 log evidence {explanation.score:.1f}"
-        notes.append(f"likeliest explanation of {subject}: {explanation.name} ({evidence})")
-        start = layers.params
-        if layers.edit.newton and not octaves:
-            return start, explanation.run
-        self.watch.stage("solving for lights and coarse gain")
-        try:
-            solved = layers.solved(explanation.run, transport)
-        except NumericalError:  # a start that goes nowhere is no reason to stop
-            return start, explanation.run
-        # What ground is lit by from elsewhere makes up for what coarse grids cannot show.
-        return start | {name: solved[name] for name in solved if name != "ground"}, explanation.run
+        edit.notes.append(f"likeliest explanation of {subject}: {explanation.name} ({evidence})")
+        if octaves or not edit.newton:
+            self.watch.stage("solving for lights and coarse gain")
+            with contextlib.suppress(NumericalError):  # a start that goes nowhere is no reason to stop
+                solved = solver.solved(explanation.run, transport)
+                # What ground is lit by from elsewhere makes up for what coarse grids cannot show.
+                solved.pop("ground", None)
+                solver.params = solver.params | solved
+        return explanation.run
 
     def _recorded(self, representation, target):
         """Return what is looked through for where layers start; None for what is fitted."""

@@ -33,7 +33,7 @@ class Linearisation:
 
     # (k, h, w, 3), by the unknowns of lights, by a camera's factors, and by the saturation
     pictures: np.ndarray
-    named: list  # (str, int, int or ndarray), which these are: name, light, and channel or axis
+    named: list  # which these are, as of :meth:`.Unknowns.named`
     profile: np.ndarray  # (h, w, 3), of the sky's light within blocks
     jacobian: list[np.ndarray]  # (blocks, nodes), by the log gain, per channel
     # Of each light (4, rows, W, 3), of the map: by log flux, each channel by its own, two angles and log size
@@ -66,10 +66,11 @@ class Derivatives:
         ``angle`` is the rotation of the finite difference by a light's direction, radians.
         """
         if self._last is None or self._last[0] is not point.rendering or self._last[1] != angle:
-            pictures, named, profile, maps = self._lights(point, angle)
+            pictures, profile, maps = self._lights(point, angle)
             by_gain = point.sky * np.float64(self.layers.changeable)
             by_gain[: self.layers.shape[0]] = self.layers.gain_slope(self.unknowns.params(point.state))
             jacobian = self.blocks.jacobian(by_gain.reshape(-1, 3))
+            named = self.unknowns.named(point.state)
             made = Linearisation(pictures, named, profile, jacobian, maps)
             self._last = point.rendering, angle, made
         return self._last[2]
@@ -86,19 +87,17 @@ class Derivatives:
         return self.blocks.profile(np.maximum(sky, 0))
 
     def _lights(self, point, angle):
-        """Return derivatives by lights and saturation, what these are, the profile, and those of the map."""
+        """Return derivatives by lights and saturation, the profile, and those of the map."""
         # ---- Cores through T: rendered, and by two angles and by size
         state, layers = point.state, self.layers
         lights: list = []
-        names: list = []
         # Columns of one light must not take the place of another's.
         lights_shining = self.unknowns.shining(state)
         most = min(COLUMNS_A_LOOK, point.transport.capacity // (4 * max(len(lights_shining), 1)))
         for i in lights_shining:
             turn, flux, size = state["turn"][i], state["flux"][i], float(state["size"][i, 0])
-            axes = self._tangents(state, i)
             turns = [turn]
-            for axis in axes:
+            for axis in self.unknowns.tangents(state, i):
                 for sign in (1, -1):
                     end = rotated(self.unknowns.direction(state, i), sign * angle * axis)
                     turns.append(rotation_vector(layers.lights.centres[i], end))
@@ -108,8 +107,6 @@ class Derivatives:
             cores = np.stack([core, *_differences(ends, angle), (larger - core) / SIZE_STEP])
             pictures = point.transport.pictures(cores, self.rows, most).reshape(4, -1, 3)
             lights.append((i, turns, cores, pictures))
-            names += [*(("turn", i, axis) for axis in axes), ("size", i, 0)]
-            names += [("flux", i, c) for c in range(3)]
 
         # ---- Glows, and the ground that lights shine on, through the blocks
         profile = self._profile(point, [pictures[0] for *_, pictures in lights])
@@ -131,13 +128,11 @@ class Derivatives:
         # ---- A camera's factor of every channel, and the saturation, through the blocks
         of_sky = []
         if self.unknowns.photographed:
-            names += [("camera", 0, c) for c in range(3)]
             of_sky += [point.rendering * np.eye(3, dtype=np.float32)[c] for c in range(3)]
         if self.unknowns.saturates:
-            names.append(("saturation", 0, 0))
             of_sky.append(self._by_saturation(point, profile))
         pictures = self._apart([pictures for *_, pictures in lights], of_sky, point.transport.shape)
-        return pictures, names, profile, [cores for _, _, cores, _ in lights]
+        return pictures, profile, [cores for _, _, cores, _ in lights]
 
     def _by_saturation(self, point, profile):
         """Return the derivative of the rendering by the log saturation, (h * w, 3), through the blocks."""
@@ -181,14 +176,6 @@ class Derivatives:
         for k, picture in enumerate(of_sky, first):
             columns[:, k] = picture.reshape(-1, 3).T
         return columns.reshape(3, -1, *shape).transpose(1, 2, 3, 0)
-
-    def _tangents(self, state, i):
-        """Two directions in which a light can move, (3,) each: axes of rotation."""
-        centre = self.unknowns.direction(state, i)
-        across = np.cross(centre, [0.0, 1.0, 0.0])
-        length = np.linalg.norm(across)
-        across = across / length if length > 1e-6 else np.array([1.0, 0, 0])
-        return across, np.cross(across, centre)
 
 
 def _differences(ends, angle):

@@ -65,7 +65,7 @@ class EditState:
 
     settings: config.Config  # what is carried out
     scene: Scene  # what is lit
-    original: np.ndarray  # (H, W, 3), the map
+    original: np.ndarray  # (H, W, 3), the map; turned, where it was
     rows: Rows  # its active rows
     free: np.ndarray | None  # bool (rows, W), active texels that may change; None: all
     # What the renderer is to make; solvers may change its weights and what it is compared with
@@ -76,6 +76,10 @@ class EditState:
     folder: Path | None  # of the checkpoint
     watch: Watch  # receives progress
     dists: distances.Dists | None = None  # as for :class:`.adam_loop.Objective`
+    degrees: float = 0.0  # by how much the map has been turned
+    # bool (H, W), active texels that keep their value; None where the renderer does not know
+    frozen: np.ndarray | None = None
+    notes: list[str] = field(default_factory=list)  # what was chosen
     _blocks: dict = field(default_factory=dict, repr=False)
 
     @property

@@ -28,9 +28,8 @@ from envedit.core.types import Params
 from envedit.losses import display_curve
 from envedit.representations.layers.unseen import unseen_kept
 from envedit.scene.renderings import rendered
-from envedit.solve import adam_loop, checkpoint, gauss_newton, hold, search
+from envedit.solve import adam_loop, checkpoint, gauss_newton, hold, photograph, search
 from envedit.solve.edit_state import EditState, Interrupted
-from envedit.solve.likelihood import SIGMA
 from envedit.solve.map_problem import Posterior
 from envedit.transport.light_transport import LightTransport
 
@@ -162,15 +161,21 @@ class LayersSolver:
         judge = self._display_error if sparing and not photographed else None
         solution = gauss_newton.solve(problem, self.params, iterations, after_step, run, sparing, judge)
         if photographed:
-            self._take_off_camera(solution)
+            photograph.take_off_camera(self.edit, solution)
         return solution
 
     def _following(self, solution, interrupt):
         """Return the run that goes on from a solution; None where it is the last."""
         if self.edit.target.painted:
             return self._held_more(solution.run)
-        settled = self._settled(solution) if self.edit.target.photo is not None else None
-        return settled or self._another(solution, interrupt) or self._corrected(solution)
+        if not self._goes_on(solution):
+            return None
+        photo = self.edit.target.photo
+        if photo is not None and not photo.settled:
+            run, self._curves = photograph.settled(self.edit, solution.run)
+            if run is not None:
+                return run
+        return self._another(solution, interrupt) or self._corrected(solution)
 
     def _notes(self, solution):
         notes = list(self._likelier)
@@ -208,61 +213,12 @@ class LayersSolver:
         return replace(likelier.run, most=len(likelier.run.history) + gauss_newton.MOST_STEPS)
 
     def _corrected(self, solution):
-        """Return a run that goes on towards the target without T's error; None where it need not."""
+        """Return a run that goes on towards the target without T's error."""
         edit, run = self.edit, solution.run
-        if not self._goes_on(solution):
-            return None
         point = gauss_newton.reached(edit.problem(), run)
         edit.target = edit.target.seen_as(point.rendering, self._path_traced(point.edited))
         most = len(run.history) + CORRECTED_STEPS
         return run.onward(most=most, corrected=True)
-
-    def _take_off_camera(self, solution):
-        """Divide the target by what the solution has of the camera's factor, which is then 1."""
-        photo, state = self.edit.target.photo, solution.run.state
-        if not solution.note:
-            self.edit.target = self.edit.target.developed(photo.exposed_by(state["camera"][0]))
-        solution.run.state = state | {"camera": np.zeros((1, 3))}
-
-    def _settled(self, solution):
-        """Return a run that goes on with the photograph as it is seen best; None where it was settled before.
-
-        It is aligned again, with the rendering of the solution, and tone curves are compared: by values of
-        the photograph, each after a few steps.
-        """
-        edit, run, photo = self.edit, solution.run, self.edit.target.photo
-        if photo.settled or not self._goes_on(solution):
-            return None
-
-        # ---- Where it lies
-        rendering = gauss_newton.reached(edit.problem(), run).rendering
-        aligned = photo.aligned(rendering)
-        if np.abs(aligned.placed.shares).max() <= 1:
-            photo = aligned
-        before = edit.target.developed(replace(photo, settled=True))
-
-        # ---- Its curve
-        tried = []
-        for curve in photo.curves:
-            edit.target = before.developed(before.photo.under(curve, rendering, before.weight))
-            problem = edit.problem()
-            one = run.onward()
-            point = gauss_newton.reached(problem, one)
-            if point.residual is None:
-                continue
-            point = gauss_newton.descended(problem, one, point, search.EXPLANATION_STEPS)
-            seen = edit.target.photo.exposed_by(one.state["camera"][0])
-            likelihood = replace(problem.likelihood, least_noise=SIGMA)
-            unlikeliness = likelihood.at_best(seen.missed(point.rendering))
-            tried.append((unlikeliness + problem.penalty(point, one.start), seen, one))
-        if not tried:  # no curve gives a finite rendering
-            edit.target = before
-            return None
-        _, seen, one = min(tried, key=lambda three: three[0])
-        self._curves = {other.camera.curve: float(value) for value, other, _ in tried}
-        edit.target = before.developed(seen)
-        one.state = one.state | {"camera": np.zeros((1, 3))}
-        return replace(one, finished=False, most=len(one.history) + gauss_newton.MOST_STEPS)
 
     def _goes_on(self, solution):
         """Whether steps were made and kept, more are allowed, and T's error is not yet off the target."""

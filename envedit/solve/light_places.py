@@ -11,14 +11,14 @@ for the best strength of the light (Tipping and Faul 2003).
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from envedit.core import latlong
 from envedit.core.arrays import tensor
-from envedit.representations.layers.lights import FAINTEST
+from envedit.representations.layers.lights import FAINTEST, LOBE_DEGREES
 from envedit.solve.map_problem import Point, Problem
 from envedit.solve.normal_equations import Normal, forward
 from envedit.transport.light_transport import LightTransport
@@ -36,11 +36,13 @@ by this share its channels are held to 0 where their strengths are found."""
 
 @dataclass(frozen=True)
 class Place:
-    """A direction (3,), what the flux (3,) of a light is multiplied by there, and by how much F falls."""
+    """Where a light could be."""
 
-    direction: np.ndarray
-    factor: np.ndarray
-    fall: float
+    direction: np.ndarray  # (3,)
+    log_flux: np.ndarray  # (3,), over its own
+    # By how much F falls there; of paint -2 log likelihood with the light, negated
+    promise: float
+    degrees: float = LOBE_DEGREES  # radius of a light that is added
 
 
 def lit_ground(problem: Problem, point: Point) -> np.ndarray | None:
@@ -133,31 +135,32 @@ class Places:
         strengths, falls = self._of_cells(flux)
         places_refined: list[Place] = []
         for at in most_promising(directions, np.where(falls > 0, falls, -np.inf)):
-            place = Place(directions[at], np.full(3, strengths[at]), float(falls[at]))
-            place = self._refined(place, flux)
+            place = self._refined(directions[at], strengths[at], falls[at], flux, scale)
             if is_apart(place.direction, [other.direction for other in places_refined]):
-                places_refined.append(replace(place, factor=place.factor / scale))
+                places_refined.append(place)
         return places_refined
 
-    def _refined(self, place, flux):
+    def _refined(self, direction, strength, fall, flux, scale):
+        """Return the best place around a cell's; strengths are of a flux (3,), that of the light / scale."""
         height, width = self.problem.envmap.shape[:2]
-        row, column = (round(float(x)) for x in latlong.texel_position(place.direction, height, width))
+        row, column = (round(float(x)) for x in latlong.texel_position(direction, height, width))
+        strengths = np.full(3, strength)
         picture = None
         for spacing in PROBE_SPACINGS:
             reach = spacing  # texels to each side: as many as they are apart
             texels, pictures = probed(
                 self.problem, self.point.transport, row, column, flux, spacing, reach, self._ground
             )
-            strengths, falls = self._of_pixels(pictures)
+            of_texels, falls = self._of_pixels(pictures)
             at = int(np.argmax(falls))
             if not falls[at] > 0:
                 break
             row, column = divmod(int(texels[at]), width)
-            there = latlong.directions(height, width)[row, column]
-            place, picture = Place(there, np.full(3, strengths[at]), float(falls[at])), pictures[at]
-        if picture is None:
-            return place
-        return replace(place, factor=self._of_channels(picture, place.factor))
+            direction = latlong.directions(height, width)[row, column]
+            strengths, fall, picture = np.full(3, of_texels[at]), falls[at], pictures[at]
+        if picture is not None:
+            strengths = self._of_channels(picture, strengths)
+        return Place(direction, np.log(strengths / scale), float(fall))
 
     def fall(self, rendering: np.ndarray) -> float:
         """Return by how much F falls with the light that makes another rendering of the point's."""
@@ -171,7 +174,7 @@ class Places:
         normal, cells = self.normal, self._cells
         columns = zip(normal.linear.jacobian, normal.squared.T, flux, strict=True)
         mixed: list[Any] = [*cells.products([j * (f * w)[:, None] for j, w, f in columns])]
-        if normal.lights:
+        if len(normal.linear.pictures):
             mixed.append(sum(cells.products([b * f for b, f in zip(normal.lights, flux, strict=True)])))
         pull: Any = sum(cells.products(list((normal.pulled * flux).T[..., None])))
         power = cells.power(normal.squared * flux**2).sum(axis=0)
@@ -205,8 +208,7 @@ class Places:
         With the derivatives by the unknowns (m, n), with the residual and with themselves, (n,) both; and
         what they do to the mean of what was not painted, (3, n).
         """
-        normal, count = self.normal, len(pictures)
-        linear = normal.linear
+        normal, linear = self.normal, self.normal.linear
         known = linear.pictures.reshape(len(linear.pictures), pictures.shape[1], 3)
         mixed: list[np.ndarray] = []
         by_pictures: Any = 0.0
@@ -220,7 +222,7 @@ class Places:
             )
             weighted = mine * np.float32(slope**2 * robust)
             mixed.append(j.T @ self.problem.blocks.sums(weighted * profile).T)
-            by_pictures = by_pictures + known[..., c] @ weighted.T if len(known) else np.zeros((0, count))
+            by_pictures = by_pictures + known[..., c] @ weighted.T
             pull = pull + mine @ (slope * robust * residual)
             power = power + np.einsum("np,np->n", mine, weighted)
         by_pixels = normal.mean_by_pixels.reshape(-1, 3)

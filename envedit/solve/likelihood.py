@@ -99,9 +99,9 @@ class Likelihood:
         return replace(likelihood, least_noise=max(SIGMA, float(np.median(target.noise))))
 
     @property
-    def robust(self) -> bool:
-        """Huber's loss in place of squares."""
-        return self.paint_noise is None
+    def painted(self) -> bool:
+        """Whether residuals are those of paint: they count by their squares, and their noise is bounded."""
+        return self.paint_noise is not None
 
     @property
     def largest_noise(self) -> float:
@@ -150,13 +150,13 @@ class Likelihood:
 
     def _pixels(self, residual, sigma):
         size = sizes(residual)
-        loss = huber(size, sigma) if self.robust else size**2
+        loss = size**2 if self.painted else huber(size, sigma)
         return float(3 * (self.weight * loss).sum() / (self.area * sigma**2))
 
     def weights(self, residual: np.ndarray, sigma: float) -> np.ndarray:
         """Return the weights (h, w, 1) under which a sum of squares has the gradient of the first part."""
         weight = self.weight / (self.area * sigma**2)
-        if self.robust:
+        if not self.painted:
             weight = weight * np.minimum(1, sigma / np.maximum(sizes(residual), 1e-12))
         return weight
 
@@ -171,7 +171,7 @@ class Likelihood:
         ratio = self._pixels(residual, least) / (3 * self.independent)
         if ratio <= 1:
             return least
-        if not self.robust:
+        if self.painted:
             return float(min(np.sqrt(ratio) * least, self.largest_noise if largest is None else largest))
         # With the n smallest r within sigma, a their sum of w r^2, and b, c those of w r and w of the others,
         # (a + 2 b sigma - c sigma^2) / (d sigma^2) is to be 1: of the n whose root lies in its range.

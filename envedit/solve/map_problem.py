@@ -125,6 +125,10 @@ class Problem(Unknowns):
         """Take another prior."""
         self.prior = prior
         self._precisions = prior.gain_precisions(self.layers.gain, self.ground)
+        self._gain_precision = sum(
+            np.kron(np.outer(axis, axis), of_axis)
+            for axis, of_axis in zip(AXES, self._precisions, strict=True)
+        )
 
     def _aim(self, picture, likelihood):
         self.picture = picture
@@ -200,23 +204,11 @@ class Problem(Unknowns):
 
     def from_start(self, state: dict, start: dict) -> float:
         """Return x' K x."""
-        total = sum(v @ k @ v for v, k in zip(AXES @ state["gain"].T, self._precisions, strict=True))
-        total += (state["saturation"][0, 0] / self.prior.saturation) ** 2
-        if self.photo is not None:
-            factor = self.photo.off_centre + state["camera"][0]
-            total += factor @ self.photo.precision @ factor
-        for i in self.shining(state):
-            change = self._flux_change(state, start, i)
-            total += change @ self.prior.flux_precision @ change
-            total += ((state["size"] - start["size"])[i, 0] / self._deviation("size", i)) ** 2
-            turn = rotation_between(self.direction(start, i), self.direction(state, i))
-            total += (float(np.linalg.norm(turn)) / self._deviation("turn", i)) ** 2
-        return float(total)
-
-    def _flux_change(self, state, start, i):
-        """Log flux of a light over that of the map; of a light that was added, over that of the start."""
-        own = self.layers.lights.own
-        return state["flux"][i] - (0.0 if i < own else start["flux"][i])
+        unknowns = self.named(state)
+        rest = self._from_prior(state, start, unknowns)[3 * self.nodes :]
+        total = rest @ self._precision_beside_gain(unknowns) @ rest
+        along = AXES @ state["gain"].T  # a third of the products that channels take
+        return float(total + sum(g @ k @ g for g, k in zip(along, self._precisions, strict=True)))
 
     # ---- normal equations ----------------------------------------------------------------------------------
 
@@ -248,32 +240,30 @@ class Problem(Unknowns):
         share, mean = self.likelihood.linear_mean(point.residual)
         slope = self._slope(point)
 
-        # ---- Gain, by blocks
-        squared = blocks.summed((slope * profile) ** 2 * robust)
-        pulled = blocks.summed(slope * profile * robust * point.residual)
-        mean_by_blocks = blocks.summed(slope * profile * share)
+        # ---- Lights and saturation, by pixels
+        rest = slice(3 * n, unknowns)
+        flat = (pictures * (slope * np.sqrt(robust))).reshape(len(pictures), slope.size)
+        hessian[rest, rest] = flat @ flat.T
+        gradient[rest] = flat @ (np.sqrt(robust) * point.residual).ravel()
+        mean_by_unknowns[:, rest] = np.einsum("khwc,hwc->ck", pictures, slope * share)
+        gradient[rest] += mean @ mean_by_unknowns[:, rest]
+
+        # ---- Gain, and what it has in common with lights, by blocks
+        of_gain = slope * profile
+        squared = blocks.summed(of_gain**2 * robust)
+        pulled = blocks.summed(of_gain * robust * point.residual)
+        mean_by_blocks = blocks.summed(of_gain * share)
+        lights_in_blocks = []
         for c, j in enumerate(linear.jacobian):
             part = slice(c * n, (c + 1) * n)
             scaled = tensor(j * np.sqrt(squared[:, c : c + 1]))
             hessian[part, part] = dr.matmul(scaled, scaled, At=True).numpy()
+            weighted = pictures[..., c] * (slope**2 * profile * robust)[..., c]
+            in_blocks = blocks.sums(weighted.reshape(len(pictures), robust.size)).T
+            hessian[rest, part] = in_blocks.T @ j
+            hessian[part, rest] = hessian[rest, part].T
             mean_by_unknowns[c, part] = mean_by_blocks[:, c] @ j
-
-        # ---- Lights and saturation, by pixels; with the gain, by blocks
-        lights_in_blocks = []
-        if len(pictures):
-            rest = slice(3 * n, unknowns)
-            flat = (pictures * (slope * np.sqrt(robust))).reshape(len(pictures), -1)
-            hessian[rest, rest] = flat @ flat.T
-            gradient[rest] = flat @ (np.sqrt(robust) * point.residual).ravel()
-            mean_by_unknowns[:, rest] = np.einsum("khwc,hwc->ck", pictures, slope * share)
-            gradient[rest] += mean @ mean_by_unknowns[:, rest]
-            for c, j in enumerate(linear.jacobian):
-                part = slice(c * n, (c + 1) * n)
-                weighted = pictures[..., c] * (slope**2 * profile * robust)[..., c]
-                in_blocks = blocks.sums(weighted.reshape(len(weighted), -1)).T
-                hessian[rest, part] = in_blocks.T @ j
-                hessian[part, rest] = hessian[rest, part].T
-                lights_in_blocks.append(in_blocks)
+            lights_in_blocks.append(in_blocks)
 
         # ---- The gradient by gain and saturation, through T
         if descent:
@@ -342,42 +332,44 @@ class Problem(Unknowns):
         return np.concatenate([one.reshape(-1, 3) for one in derivatives]), colour
 
     def _precision(self, unknowns):
-        """K: of the gain diagonal in luminance, chroma and tint, of lights by their kinds."""
-        n = self.nodes
-        precision = np.zeros((3 * n + len(unknowns),) * 2)
-        for a, axis in enumerate(AXES):
-            for c, d in np.ndindex(3, 3):
-                precision[c * n : c * n + n, d * n : d * n + n] += axis[c] * axis[d] * self._precisions[a]
-        for k, (name, i, axis) in enumerate(unknowns, 3 * n):
+        """Return K of the gain, channel by channel, and of the unknowns beside it."""
+        gain = 3 * self.nodes
+        precision = np.zeros((gain + len(unknowns),) * 2)
+        precision[:gain, :gain] = self._gain_precision
+        precision[gain:, gain:] = self._precision_beside_gain(unknowns)
+        return precision
+
+    def _precision_beside_gain(self, unknowns):
+        precision = np.zeros((len(unknowns),) * 2)
+        for k, (name, i, axis) in enumerate(unknowns):
             if name == "flux":
                 precision[k, k - axis : k - axis + 3] = self.prior.flux_precision[axis]
             elif name == "camera":
                 precision[k, k - axis : k - axis + 3] = self.photo.precision[axis]
+            elif name == "size" and i >= self.layers.lights.own:
+                precision[k, k] = self.prior.added_size**-2.0
             else:
-                precision[k, k] = self._deviation(name, i) ** -2.0
+                precision[k, k] = getattr(self.prior, name) ** -2.0
         return precision
 
-    def _deviation(self, name, i):
-        """Return the standard deviation of a light's direction or size, or of the saturation."""
-        if name in ("turn", "saturation"):
-            return getattr(self.prior, name)
-        return self.prior.size if i < self.layers.lights.own else self.prior.added_size
-
     def _from_prior(self, state, start, unknowns):
-        """How far the unknowns are from where the prior draws them."""
-        parts = [state["gain"].T.ravel()]
+        """Return x: how far the unknowns are from where the prior draws them.
+
+        That is the start, but for the flux of the map's own lights, which is drawn to the original's.
+        """
+        own = self.layers.lights.own
+        values = []
         for name, i, axis in unknowns:
-            if name == "flux":
-                parts.append([self._flux_change(state, start, i)[axis]])
+            if name == "turn":
+                turn = rotation_between(self.direction(start, i), self.direction(state, i))
+                values.append(turn @ axis)
             elif name == "camera":
-                parts.append([self.photo.off_centre[axis] + state[name][i, axis]])
-            elif name == "saturation":
-                parts.append(state[name][i])
-            elif name == "turn":
-                parts.append([rotation_between(self.direction(start, i), self.direction(state, i)) @ axis])
+                values.append(self.photo.off_centre[axis] + state[name][i, axis])
+            elif name == "saturation" or (name == "flux" and i < own):
+                values.append(state[name][i, axis])
             else:
-                parts.append([(state[name] - start[name])[i, axis]])
-        return np.concatenate(parts)
+                values.append(state[name][i, axis] - start[name][i, axis])
+        return np.concatenate([state["gain"].T.ravel(), values])
 
     def step(self, state: dict, normal: Normal, damping: float) -> dict | None:
         """Return the state after a damped step; None if the step is not finite."""

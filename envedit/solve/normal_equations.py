@@ -27,7 +27,7 @@ class Normal:
     # squared, pulled: (blocks, 3), of weight times slope squared, and of weight, slope and residual
     squared: np.ndarray
     pulled: np.ndarray
-    # (blocks, k), of weight times slope squared times pictures of lights, per channel; may be empty
+    # (blocks, k), of weight times slope squared times pictures of lights, per channel
     lights: list[np.ndarray]
     # ---- The mean of what was not painted, q of ``likelihood.py``, as one more residual of each channel
     mean: np.ndarray  # (3,), its value

@@ -16,10 +16,10 @@ from envedit.core import latlong
 from envedit.core.arrays import flat, tensor
 from envedit.core.rotations import rotation_vector
 from envedit.losses import display_curve
-from envedit.representations.layers.lights import LOBE_DEGREES
 from envedit.solve.light_places import (
     PLACES_APART_COSINE,
     PROBE_SPACINGS,
+    Place,
     is_apart,
     lit_ground,
     most_promising,
@@ -40,19 +40,9 @@ POSITIVE_EVIDENCE = 2.0
 a bare mention" (Kass and Raftery 1995)."""
 
 
-@dataclass(frozen=True)
-class PaintedPlace:
-    """A direction (3,), the log flux (3,) of a light there, over its own, and -2 log likelihood with it."""
-
-    direction: np.ndarray
-    log_flux: np.ndarray
-    unlikeliness: float
-    degrees: float = LOBE_DEGREES  # radius of a light that is added
-
-
 def best(
     problem: Problem, state: dict, transport: LightTransport, k: int, away: np.ndarray | None = None
-) -> list[PaintedPlace]:
+) -> list[Place]:
     """List where light ``k``, dark in a state, raises the likelihood most, through ``transport``.
 
     All cells of the sky are tried through the block transport, with several fluxes each, and texels around
@@ -77,7 +67,7 @@ def best(
     factors, unlikeliness = compared.best(blocks.cells(trial.ground).of(lights.flux[k]), trial.own)
     if away is not None:
         unlikeliness = np.where(directions @ away > PLACES_APART_COSINE, np.inf, unlikeliness)
-    places: list[PaintedPlace] = []
+    places: list[Place] = []
     texels: list[np.ndarray] = []
     for at in most_promising(directions, -unlikeliness):
         texel = trial.texel(directions[at])
@@ -90,8 +80,8 @@ def best(
 
 def _smallest(sizes):
     """Return the first of places, by size, that promises as much as the best one."""
-    least = min(place.unlikeliness for place in sizes) + POSITIVE_EVIDENCE
-    return next(place for place in sizes if not place.unlikeliness > least)  # the first where none is finite
+    least = max(place.promise for place in sizes) - POSITIVE_EVIDENCE
+    return next(place for place in sizes if not place.promise < least)  # the first where none is finite
 
 
 class _TriedLight:
@@ -121,7 +111,7 @@ class _TriedLight:
             at = int(np.argmin(unlikeliness))
             row, column = divmod(int(texels[at]), width)
         direction = latlong.directions(height, width)[row, column]
-        return PaintedPlace(direction, np.full(3, np.log(factors[at])), float(unlikeliness[at]))
+        return Place(direction, np.full(3, np.log(factors[at])), -float(unlikeliness[at]))
 
     def lobe(self, direction, degrees):
         """Return the place of a lobe of some radius."""
@@ -134,7 +124,7 @@ class _TriedLight:
             light = layers.ground_light.irradiance(core[0, : layers.shape[0]])
             picture += np.float32(light * self.ground)
         factors, unlikeliness = self._best(picture.reshape(1, -1, 3))
-        return PaintedPlace(direction, np.full(3, np.log(factors[0])), float(unlikeliness[0]), degrees)
+        return Place(direction, np.full(3, np.log(factors[0])), -float(unlikeliness[0]), degrees)
 
     def _best(self, pictures):
         """Return the best factors of the flux of pictures (k, pixels, 3), and -2 log likelihood then."""

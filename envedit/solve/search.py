@@ -151,7 +151,7 @@ def _others(best, compared):
 def _unfollowed(problem, best):
     """Whether paint is followed so little that its noise is the largest there may be."""
     likelihood = problem.likelihood
-    if likelihood.robust or likelihood.largest_noise <= likelihood.least_noise:
+    if not likelihood.painted or likelihood.largest_noise <= likelihood.least_noise:
         return False
     return likelihood.noise(best.point.residual) >= likelihood.largest_noise
 
@@ -174,7 +174,7 @@ def _neighbours(problem, best, moves, after_step, steps, anew):
 def _cost_of_place(problem: Problem) -> float:
     """Return what a light's place costs that was looked for: of a rendering it could be in any cell."""
     _, directions = problem.blocks.sky
-    return 2 * np.log(max(len(directions), 1)) * problem.likelihood.robust
+    return 0.0 if problem.likelihood.painted else 2 * np.log(max(len(directions), 1))
 
 
 def _cost_of_choice(problem: Problem) -> float:
@@ -182,24 +182,20 @@ def _cost_of_choice(problem: Problem) -> float:
     return 2 * np.log(max(problem.layers.lights.own, 1))
 
 
-def _cost_of_light(problem: Problem) -> float:
-    """Return what an added light costs."""
-    return ADDED_LIGHT_COST + _cost_of_place(problem)
-
-
 def score(problem: Problem, run: gauss_newton.Run, point: Point) -> float:
     """Return what explanations are compared by, lower where likelier; inf where it is not finite."""
     if point.residual is None:
         return np.inf
     # ---- What lights cost
-    cost = _cost_of_light(problem) * len(problem.added(run.state))
-    cost += (_cost_of_choice(problem) + _cost_of_place(problem)) * len(_replaced(problem, run))
+    cost_of_place = _cost_of_place(problem)
+    cost = (ADDED_LIGHT_COST + cost_of_place) * len(problem.added(run.state))
+    cost += (_cost_of_choice(problem) + cost_of_place) * len(_replaced(problem, run))
     # ---- How likely all else is
-    if problem.likelihood.robust:
+    if problem.likelihood.painted:
+        cost += problem.loss(point, run.start, problem.likelihood.largest_noise)
+    else:
         cost += FADED_LIGHT_COST * len(_faded(problem, run.state))
         cost += problem.unlikeliness(point, run.start) + _determined(problem, run, point)
-    else:
-        cost += problem.loss(point, run.start, problem.likelihood.largest_noise)
     return float(cost) if np.isfinite(cost) else np.inf
 
 
@@ -234,15 +230,16 @@ def _descended(problem, done, run, transport, steps, likeliest):
 
     point = problem.evaluate(run.state, transport)
     if point.residual is not None:
+        painted, largest_noise = problem.likelihood.painted, problem.likelihood.largest_noise
         point = gauss_newton.descended(
             problem,
             run,
             point,
             steps,
-            hopeless=None if problem.likelihood.robust else hopeless,
-            largest_noise=problem.likelihood.largest_noise,
+            hopeless=hopeless if painted else None,
+            largest_noise=largest_noise,
         )
-        run.finished &= problem.likelihood.robust  # paint is followed further
+        run.finished &= not painted  # paint is followed further
     return Explanation(done, run, point, score(problem, run, point))
 
 
@@ -251,9 +248,9 @@ def _descended(problem, done, run, transport, steps, likeliest):
 
 def _moves(problem, best):
     """List the moves of each kind that promise as much from an explanation as the best one does."""
-    painted = not problem.likelihood.robust
+    promised = _under_the_original if problem.likelihood.painted else _beside_the_sky
     of_kind: dict[tuple[int, str], list[_Move]] = {}
-    for move in (_under_the_original if painted else _beside_the_sky)(problem, best):
+    for move in promised(problem, best):
         of_kind.setdefault((move.light, move.what), []).append(move)
     return [
         move
@@ -280,7 +277,7 @@ def _beside_the_sky(problem, best):
             continue
         stays = places.fall(best.point.rendering)
         # ---- out
-        worth = ADDED_LIGHT_COST if own else _cost_of_light(problem)
+        worth = ADDED_LIGHT_COST if own else ADDED_LIGHT_COST + _cost_of_place(problem)
         if k in _faded(problem, state):
             worth = FADED_LIGHT_COST
         yield _Move(k, REMOVED, dark, start, gain=worth - stays)
@@ -289,18 +286,17 @@ def _beside_the_sky(problem, best):
             if there.direction @ problem.direction(state, k) > np.cos(LARGEST_STEP["turn"]):
                 continue
             turn = rotation_vector(lights.centres[k], there.direction)
-            flux = start["flux"][k] if own else np.log(there.factor)
+            flux = start["flux"][k] if own else there.log_flux
             moved, centre = (with_light(one, k, turn=turn, flux=flux) for one in (state, start))
-            yield _Move(k, MOVED, moved, centre, gain=there.fall - stays)
+            yield _Move(k, MOVED, moved, centre, gain=there.promise - stays)
 
     # ---- one more
-    spare = [k for k in range(lights.own, lights.count) if k not in problem.added(state)]
-    for k in spare[:1]:
-        places = _places(problem, state, start, transport)
-        for there in places.best(k) if places else []:
-            turn, flux = rotation_vector(lights.centres[k], there.direction), np.log(there.factor)
-            more, centre = (with_light(one, k, turn=turn, flux=flux, size=0.0) for one in (state, start))
-            yield _Move(k, ADDED, more, centre, gain=there.fall - ADDED_LIGHT_COST)
+    spare = problem.spare(state)
+    places = None if spare is None else _places(problem, state, start, transport)
+    for there in places.best(spare) if places else []:
+        turn, flux = rotation_vector(lights.centres[spare], there.direction), there.log_flux
+        more, centre = (with_light(one, spare, turn=turn, flux=flux, size=0.0) for one in (state, start))
+        yield _Move(spare, ADDED, more, centre, gain=there.promise - ADDED_LIGHT_COST)
 
 
 def _places(problem, state, start, transport):
@@ -319,7 +315,7 @@ def _under_the_original(problem, best):
     """Yield moves that raise the likelihood under the gain of the original, all else as it is."""
     state, start = _under_original_sky(best.run.state), best.run.start
     lights, transport = problem.layers.lights, best.point.transport
-    spare = [k for k in range(lights.own, lights.count) if k not in problem.added(state)]
+    spare = problem.spare(state)
     now = _unlikeliness(problem, state, transport)
 
     for k in problem.shining(state):
@@ -331,14 +327,14 @@ def _under_the_original(problem, best):
         for there in painted_places.best(problem, dark, transport, k, away):
             moved = _put(lights, state, k, there)
             centre = with_light(start, k, turn=moved["turn"][k]) if own else _put(lights, start, k, there)
-            yield _Move(k, MOVED, moved, centre, gain=now - there.unlikeliness - cost)
+            yield _Move(k, MOVED, moved, centre, gain=now + there.promise - cost)
         # ---- softer: a light of few texels cannot grow, as its texels would part; a lobe can
-        if own and spare:
-            flux = state["flux"][k] + log_flux_of(lights.flux[k] / lights.flux[spare[0]])
-            turn = rotation_vector(lights.centres[spare[0]], away)
+        if own and spare is not None:
+            flux = state["flux"][k] + log_flux_of(lights.flux[k] / lights.flux[spare])
+            turn = rotation_vector(lights.centres[spare], away)
             size = lights.log_size(painted_places.LARGER_DEGREES[0])
-            soft = with_light(dark, spare[0], turn=turn, flux=flux, size=size)
-            centre = with_light(start, spare[0], turn=turn, flux=flux, size=size)
+            soft = with_light(dark, spare, turn=turn, flux=flux, size=size)
+            centre = with_light(start, spare, turn=turn, flux=flux, size=size)
             yield _Move(k, SOFTENED, soft, centre, gain=now - _unlikeliness(problem, soft, transport))
         # ---- out, if it was added
         if not own:
@@ -346,10 +342,9 @@ def _under_the_original(problem, best):
             yield _Move(k, REMOVED, dark, start, gain)
 
     # ---- one more, as large as it must be
-    for k in spare[:1]:
-        for there in painted_places.best(problem, state, transport, k):
-            more, centre = (_put(lights, one, k, there) for one in (state, start))
-            yield _Move(k, ADDED, more, centre, gain=now - there.unlikeliness - ADDED_LIGHT_COST)
+    for there in () if spare is None else painted_places.best(problem, state, transport, spare):
+        more, centre = (_put(lights, one, spare, there) for one in (state, start))
+        yield _Move(spare, ADDED, more, centre, gain=now + there.promise - ADDED_LIGHT_COST)
 
 
 def _under_original_sky(state):

@@ -100,14 +100,23 @@ class Unknowns:
             params.pop("saturation", None)
         return params
 
+    def named(self, state: dict) -> list[tuple[str, int, Any]]:
+        """List the unknowns of a state beside the gain: name, light, and channel or axis (3,) of its turn."""
+        names: list[tuple[str, int, Any]] = []
+        for i in self.shining(state):
+            names += [("turn", i, axis) for axis in self.tangents(state, i)]
+            names += [("size", i, 0), ("flux", i, 0), ("flux", i, 1), ("flux", i, 2)]
+        names += [("camera", 0, c) for c in range(3)] * self.photographed
+        names += [("saturation", 0, 0)] * self.saturates
+        return names
+
     def moved(
         self, state: dict, step: np.ndarray, names: list, largest: dict[str, float] | None = None
     ) -> dict[str, np.ndarray]:
         """Return the state after a step (3 nodes + len(names),).
 
-        It is of the gain's nodes channel by channel, then of what is named. A name is which unknown, of which
-        light, and which channel or axis (3,) of its turn; ``largest`` bounds the step of each, by default not
-        at all.
+        It is of the gain's nodes channel by channel, then of what is named as of :meth:`named`; ``largest``
+        bounds the step of each, by default not at all.
         """
         kinds = "gain", "turn", "flux", "size", "saturation", "camera"
         bound = dict.fromkeys(kinds, np.inf) | (largest or {})
@@ -146,6 +155,11 @@ class Unknowns:
         """List the added lights that shine: spare ones whose flux is not 0."""
         return [i for i in self.shining(state) if i >= self.layers.lights.own]
 
+    def spare(self, state: dict) -> int | None:
+        """Return the first light that is not the map's and does not shine; None where all do."""
+        lights, added = self.layers.lights, self.added(state)
+        return next((i for i in range(lights.own, lights.count) if i not in added), None)
+
     def shining(self, state: dict) -> list[int]:
         """List the lights whose flux is not 0."""
         return [i for i, flux in enumerate(state["flux"]) if flux.max() > DARK + 1]
@@ -153,6 +167,14 @@ class Unknowns:
     def direction(self, state: dict, i: int) -> np.ndarray:
         """Return where light ``i`` is, (3,)."""
         return rotated(self.layers.lights.centres[i], state["turn"][i])
+
+    def tangents(self, state: dict, i: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return two directions in which light ``i`` can move, (3,) each: axes of rotation."""
+        centre = self.direction(state, i)
+        across = np.cross(centre, [0.0, 1.0, 0.0])
+        length = np.linalg.norm(across)
+        across = across / length if length > 1e-6 else np.array([1.0, 0, 0])
+        return across, np.cross(across, centre)
 
 
 def with_light(state: dict, k: int, **values: Any) -> dict:

@@ -825,11 +825,13 @@ def test_how_far_a_light_lowers_f_is_what_the_normal_equations_say(of, request):
     of_channels = np.block([[normal.hessian, columns.T], [columns, damped]])
     pulls = [pull_of(one) for one in apart]
     strengths = -np.linalg.solve(of_channels, np.append(normal.gradient, pulls))[-3:]
-    np.testing.assert_allclose(found.factor, np.maximum(strengths, 1e-3 * strengths.max()), rtol=3e-3)
+    np.testing.assert_allclose(
+        np.exp(found.log_flux), np.maximum(strengths, 1e-3 * strengths.max()), rtol=3e-3
+    )
     fall = pull @ np.linalg.solve(larger, pull) - normal.gradient @ np.linalg.solve(
         normal.hessian, normal.gradient
     )
-    assert found.fall == pytest.approx(fall, rel=1e-3)
+    assert found.promise == pytest.approx(fall, rel=1e-3)
     # The same of the light's picture, as of one that is there.
     there = point.rendering + np.float32(strength * atom).reshape(*FILM, 3)
     assert light_places.Places(problem, point, normal).fall(there) == pytest.approx(fall, rel=2e-3)

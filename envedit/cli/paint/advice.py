@@ -16,6 +16,7 @@ from envedit.core.rotations import rotation_vector
 from envedit.representations.layers.lights import DARK
 from envedit.solve import painted_places
 from envedit.solve.feasibility import WARNED_SHARE, Reach
+from envedit.solve.light_places import Place
 from envedit.solve.map_problem import Problem
 from envedit.solve.unknowns import with_light
 
@@ -167,7 +168,7 @@ def _best(problem, without, start, k, request, away=None):
     ``without`` is a state where it is dark, ``start`` the map's, ``away`` where it is not to be.
     """
     lights = problem.layers.lights
-    most: tuple[float, painted_places.PaintedPlace | None] = 0.0, None
+    most: tuple[float, Place | None] = 0.0, None
     for there in painted_places.best(problem, without, problem.transport, k, away):
         turn = rotation_vector(lights.centres[k], there.direction)
         size = start["size"][k] if k < lights.own else lights.log_size(there.degrees)

@@ -79,7 +79,7 @@ def worked_on(
             if target.clipped is not None:
                 target = replace(target, clipped=at_size(target.clipped, scene, small) > 0)
             noise = rendered_anew.noise(picture, small.rows)
-            spp = rendered_anew.samples(picture, noise, *with_noise(settings, small, envmap)[:2], small.rows)
+            spp = rendered_anew.samples(noise, *with_noise(settings, small, envmap)[:2], small.rows)
         else:
             picture, spp, noise = with_noise(settings, small, target.envmap)
         weight = np.where(hidden[..., None], 0, at_size(target.weight, scene, small)).astype(np.float32)

@@ -252,7 +252,7 @@ def _dry_run(settings, base, console):
             {"initial": target.initial, "target": target.picture},
             {"initial": envmap, "target": target.envmap},
             settings.output.tonemap,
-            [view.rows for view in scene.views],
+            scene.rows,
         )
         write_atomically(picture_file, sheet)
         images.write_exr(radiance_file, target.picture, {"content": "target"}, panorama=False)

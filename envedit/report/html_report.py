@@ -179,10 +179,9 @@ def _painted(result):
     if result.reach is None:
         return []
     codes = np.rint(255 * preview.unreachable(result.reach)).astype(np.uint8)
-    views = [view.rows for view in result.views] if len(result.views) > 1 else [slice(None)]
     caption = f"what is not feasible; {100 * result.reach.share:.0f} % of the painted change is feasible"
     words = parts.scale(("marked red: stays darker than painted", "marked blue: brighter"))
-    return [parts.figure(codes[rows], caption, words) for rows in views]
+    return [parts.figure(codes[rows], caption, words) for rows in result.rows or (slice(None),)]
 
 
 def _photograph(result):

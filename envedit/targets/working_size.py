@@ -52,11 +52,11 @@ def smaller(settings: config.Config, scene: Scene, painted: bool = False) -> Sce
 
 def scaled(scene: Scene, factor: float) -> Scene | None:
     """Return the scene on a film that is ``factor`` times as wide and high; None if it is built already."""
-    if scene.again is None:
+    if scene.resized is None:
         return None
     heights = {rows.stop - rows.start for rows in scene.rows}
     height = max(1, round(factor * heights.pop())) if len(heights) == 1 else 0  # 0: by each view's aspect
-    return scene.again(max(4, round(factor * scene.width)), height)
+    return scene.resized(max(4, round(factor * scene.width)), height)
 
 
 def worked_on(

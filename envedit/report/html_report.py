@@ -53,10 +53,8 @@ def write_report(path: FilePath, result: Result, manifest: dict) -> None:
     # ---- What is shown
     metrics = plain(result.metrics, "", [])
     tonemap = settings.output.tonemap
-    renders = preview.known(result.shown)
     maps = preview.known(result.maps)
-    names = list(dict.fromkeys([*result.renders, *result.maps]))
-    by_view = _by_view(renders, result.views)
+    by_view = _by_view(result.shown, result.views)
 
     warnings = result.warnings
     source = result.input_map.source if result.input_map else settings.input.envmap
@@ -70,7 +68,7 @@ def write_report(path: FilePath, result: Result, manifest: dict) -> None:
         f"<title>{title}</title><style>{parts.STYLE}</style></head><body>",
         f'<h1>{title}</h1><p class="verdict">{escape(verdict(metrics))}</p>',
         f'<div class="warnings"><strong>Warnings</strong>{parts.listing(warnings)}</div>' if warnings else "",
-        _pictures(names, by_view, maps, tonemap),
+        _pictures(list(result.maps), by_view, maps, tonemap),
         _section("Differences", _differences(by_view, maps, tonemap), 2),
         _section("Lights and background", parts.lights_figure(maps["edited"], result.lights, tonemap), 1),
         _section("", _separation(result.separation, tonemap)),

@@ -140,7 +140,7 @@ def test_columns_that_made_room_come_back_with_the_same_bits(air, monkeypatch):
     columns.bind(Columns(texels[:3], paths[:3]), again)
     columns.read(Columns(texels[4:5], paths[4:5]))
     with monkeypatch.context() as patch:
-        patch.setattr(path_vertices, "contributions", lambda *_: 1 / 0)
+        patch.setattr(path_vertices, "column_values", lambda *_: 1 / 0)
         columns.read(Columns(texels[:3], paths[:3]))
         with pytest.raises(ZeroDivisionError):
             columns.read(Columns(texels[3:4], paths[3:4]))

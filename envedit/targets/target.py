@@ -173,8 +173,7 @@ def _of_paint(settings, scene, envmap, picture, mask):
         painted = painted_strokes(scene, initial, chosen.strokes, chosen.display_tonemap)
         if not painted.coverage.any():
             raise ConfigError("; ".join(painted.warnings))
-        count = len(chosen.strokes)
-        source = f"painted: {count} stroke{'s' * (count != 1)} on the initial rendering"
+        source = f"painted: {counted(len(chosen.strokes), 'stroke', 'strokes')} on the initial rendering"
     if chosen.kind == "image" and mask is None and not chosen.masks:
 
         def again():

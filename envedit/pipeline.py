@@ -190,7 +190,7 @@ class _Edit:
             self.target = None
             if settings.target.kind == "none":
                 return
-            expected = settings.target.kind in ("image", "strokes")
+            expected = settings.target.painted
             self.small = working_size.smaller(settings, self.scene, painted=expected)
             renderers.check(settings, self.small, self.original.shape[:2])
             self.watch.stage("rendering the target")

@@ -110,9 +110,10 @@ def test_strokes_lie_on_the_initial_rendering_and_beside_it_are_refused(ball, se
     np.testing.assert_allclose(made.picture[3:9, 4:12], 0.5 * initial[3:9, 4:12], rtol=1e-6)
     np.testing.assert_array_equal(made.picture[:3], initial[:3])
     assert made.envmap is None and made.asked == () and "1 stroke on" in made.source
-    with pytest.raises(ConfigError, match=r"target\.strokes"):
-        beside = a_stroke(rectangle=[3, 3, 4, 4])
-        target.make(asking(kind="strokes", strokes=(beside,)), ball, seen[0])
+    says = r"target\.strokes\[0\] \(shadow\): lies outside .*; target\.strokes\[1\] \(shadow\): opacity 0"
+    with pytest.raises(ConfigError, match=says):
+        nothing = a_stroke(rectangle=[3, 3, 4, 4]), a_stroke(opacity=0)
+        target.make(asking(kind="strokes", strokes=nothing), ball, seen[0])
 
 
 def test_an_array_asks_what_its_file_would(ball, seen, tmp_path):

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from envedit import config, inputs
 from envedit.config.validators import Integer, named, show
 from envedit.core.errors import ConfigError, InputError
-from envedit.core.radiance import require_unmasked
+from envedit.core.radiance import unmasked
 from envedit.images import analytic_sky, images
 from envedit.images.headers import MAX_SIDE
 from envedit.pipeline import Watch, run
@@ -347,11 +347,7 @@ def _settings(settings: object) -> tuple[config.Config, Path | None]:
 
 def _array(name: str, value: ArrayLike) -> np.ndarray:
     """Return an argument as float32, as which it is saved; shape and values are checked where it is used."""
-    require_unmasked(value, name)
-    try:
-        array = np.asarray(value)
-    except (TypeError, ValueError):  # rows of different lengths
-        array = np.asarray(None)
+    array = unmasked(value, name)
     if array.dtype.kind not in "fiu":
         raise InputError(f"{name}: got {show(value)}, expected an array of numbers")
     with np.errstate(over="ignore"):  # what leaves float32 becomes infinite, and is refused as such

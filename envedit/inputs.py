@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from envedit import config
+from envedit.config.presets import MAP_WORDS
 from envedit.core import latlong, primaries
 from envedit.core.errors import ConfigError, InputError, NumericalError
 from envedit.core.primaries import Chromaticities
@@ -22,8 +23,8 @@ from envedit.representations.layers.placed_lights import ByHand, PlacedLights, m
 from envedit.scene import built_scene, supported
 from envedit.scene.scene import Scene
 
-SUNSKY, SCENE, AUTO = "sunsky", "scene", "auto"
-"""Words for ``[input] envmap``: Mitsuba's analytic sky; the scene's own light; that one if there is one."""
+AUTO, SCENE, SUNSKY = MAP_WORDS
+"""Words for ``[input] envmap``: the scene's own light if it has one; that light; Mitsuba's analytic sky."""
 _ROUNDING = 1e-6  # of a texel's largest channel
 
 

@@ -34,6 +34,7 @@ from envedit.solve import adam_loop, adam_solver, feasibility
 from envedit.solve.edit_state import Interrupted, Stopped, Watch
 from envedit.solve.likelihood import SIGMA, Likelihood, sizes
 from envedit.targets import working_size
+from envedit.targets.pixel_weights import hidden_pixels
 from envedit.targets.target import Target
 from envedit.targets.target import make as make_target
 from envedit.targets.working_size import at_size
@@ -189,7 +190,7 @@ class _Edit:
             self.target = None
             if settings.target.kind == "none":
                 return
-            expected = settings.target.kind in ("image", "strokes")
+            expected = settings.target.painted
             self.small = working_size.smaller(settings, self.scene, painted=expected)
             renderers.check(settings, self.small, self.original.shape[:2])
             self.watch.stage("rendering the target")
@@ -277,10 +278,7 @@ class _Edit:
         if self.small is self.scene:
             self.target = self.job.target  # a resumed run has the picture that it began with
         elif photo is not None:
-            found = self.job.target.photo
-            laid = photo.laid(photo.values.shape, found.placed)
-            laid = replace(laid, camera=found.camera, recognised=found.recognised)
-            self.target = self.target.developed(laid)
+            self.target = self.target.developed(photo.of_array(self.job.target.photo.array))
         if photo is not None and photo.stops is None:
             self.set_level()
 
@@ -321,8 +319,7 @@ class _Edit:
             self.predicted_error = self.transport.coarse_error(self.edited)
 
     def _adjusted(self, envmap):
-        if self.level != 1:
-            envmap = envmap * np.float32(self.level)
+        envmap = envmap if self.level == 1 else envmap * np.float32(self.level)
         return adjustments.adjust(envmap, self.settings.lights, self.settings.output, self.map.scale)
 
     def check_feasibility(self):
@@ -381,7 +378,7 @@ class _Edit:
     def render_variants(self):
         """Render the other explanations of paint, and measure how far they follow it."""
         target, tonemap = self.target, self.settings.output.tonemap
-        seen = None if self.scene.alpha is None else self.scene.alpha > 0
+        seen = ~hidden_pixels(self.scene)
         for explanation in self.solver.others if self.job else ():
             with self.clock("judge_s"):
                 self.watch.stage("rendering other explanations")
@@ -468,10 +465,10 @@ class _Edit:
     def _compared(self, rows, views=()):
         """Compare rows of the renderings with those of the target."""
         renders = self.renders
-        seen = None if self.scene.alpha is None else self.scene.alpha[rows] > 0
+        seen = ~hidden_pixels(self.scene)[rows]
         if photo := self.target.photo:
             renders = {name: photo.displayed(picture) for name, picture in renders.items()}
-            seen = (photo.counts[..., 0] > 0) & (True if seen is None else seen)
+            seen &= photo.counts[..., 0] > 0
         initial, target, edited = (renders[name][rows] for name in ("initial", "target", "edited"))
         tonemap = self.settings.output.tonemap
 
@@ -500,7 +497,7 @@ class _Edit:
             return 0.0
         name = self.settings.output.tonemap
         before, after = (color.tonemap(picture, name) for picture in (target.initial, target.picture))
-        seen = True if self.scene.alpha is None else self.scene.alpha[..., None] > 0
+        seen = ~hidden_pixels(self.scene)[..., None]
         requested = float((target.coverage * np.abs(after - before) * seen).mean())
         return painted["elsewhere"] * float(((1 - target.coverage) * seen).mean()) / max(requested, 1e-30)
 

@@ -101,6 +101,11 @@ class Result:
         return self.found.representation.separation if self.found else None
 
     @property
+    def rows(self) -> tuple[slice, ...]:
+        """Rows of each view in a rendering."""
+        return tuple(view.rows for view in self.views)
+
+    @property
     def render(self) -> np.ndarray:
         """The rendering under the edited map, by Mitsuba with fresh samples."""
         return self.renders["edited"]
@@ -128,8 +133,7 @@ class Result:
 
     def _repr_png_(self) -> bytes:
         """Show the renderings over their maps in a notebook."""
-        views = [view.rows for view in self.views]
-        return preview.sheet(self.shown, self.maps, self.settings.output.tonemap, views)
+        return preview.sheet(self.shown, self.maps, self.settings.output.tonemap, self.rows)
 
     def plot(self) -> Figure:
         """Draw renderings and maps: initial, target and edited; maps over azimuth and elevation, degrees.
@@ -200,6 +204,7 @@ class Result:
         for _ in range(count):
             envmap = before.copy()
             envmap[rows] = self.found.representation.decode(self.posterior.sample(rng)).numpy()
+            envmap *= np.float32(self.found.level)
             adjusted, _ = adjustments.adjust(envmap, settings.lights, settings.output, self.input_map.scale)
             drawn.append(self.input_map.as_stored(adjusted, self.found.turn_degrees))
         return np.stack(drawn) if drawn else np.zeros((0, *self.envmap.shape), np.float32)

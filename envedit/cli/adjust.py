@@ -87,8 +87,7 @@ def _adjust(arguments, console):
     doctor.select()
     input_map = map_command.read(arguments.map, arguments, console)
     radiance, notes = adjusted(map_file.radiance_of(input_map), how)
-    for line in notes:
-        console.say(line)
+    console.say(*notes)
     for name, file in files.items():
         if name == "background":
             radiance, done = adjusted(radiance, second)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from envedit.cli import doctor, map_command
+from envedit.core.errors import counted
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -56,4 +57,4 @@ def _blend(arguments, console):
         values = map_file.as_stored(radiance, first)
     map_command.write(path, values, first, console)
     console.facts |= {"files": {"map": str(path)}, "amount": arguments.amount, "lights": lights}
-    console.say(f"{len(lights)} light{'s' * (len(lights) != 1)}; {path}" if lights else str(path))
+    console.say(f"{counted(len(lights), 'light', 'lights')}; {path}" if lights else str(path))

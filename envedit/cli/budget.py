@@ -178,5 +178,5 @@ def calibrate(settings: config.Config, base: Path | None = None) -> Calibration:
         quiet_spp=int(np.clip(quiet_spp, QUIET_LEAST, QUIET_MOST)),
         aspect=scene.height / scene.width,
         texels=input_map.size[0] * input_map.size[1] if in_file else 0,
-        painted=settings.target.kind in ("image", "strokes"),
+        painted=settings.target.painted,
     )

@@ -59,8 +59,7 @@ def _compare(arguments, console):
         manifest.write_json(folder / "compare.json", measured)
     files = {name: str(folder / name) for name in RESULTS}
     console.facts |= {"folder": str(folder), "files": files, **measured}
-    for line in _lines(measured):
-        console.say(line)
+    console.say(*_lines(measured))
     console.say(f"difference.png: full colour is {scale:g} stops; results in {folder}")
 
 

@@ -54,15 +54,16 @@ class Console:
         self._json_lines = json_lines
         self.facts: dict[str, Any] = {}
 
-    def say(self, line: str) -> None:
-        """Write a line of text, unless there will be an object."""
-        if not (self._quiet or self._one_object):
+    def say(self, *lines: str) -> None:
+        """Write lines of text, unless there will be an object."""
+        for line in () if self._quiet or self._one_object else lines:
             print(line)
 
-    def warn(self, text: str) -> None:
-        """Report a warning."""
-        self.facts.setdefault("warnings", []).append(text)
-        self._report("warning", text, f"{self._name}: warning: {text}")
+    def warn(self, *texts: str) -> None:
+        """Report warnings."""
+        for text in texts:
+            self.facts.setdefault("warnings", []).append(text)
+            self._report("warning", text, f"{self._name}: warning: {text}")
 
     def error(self, text: str) -> None:
         """Report an error."""

@@ -39,7 +39,6 @@ def _convert(arguments, output):
     converted = conversion.convert(
         arguments.file, Path(arguments.scene).absolute(), arguments.camera, arguments.time
     )
-    for note in converted.notes:
-        output.warn(note)
+    output.warn(*converted.notes)
     output.facts["files"] = {converted.xml.name: str(converted.xml)}
     output.say(f"{arguments.scene}: written; now, for example: envedit paint {arguments.scene}")

@@ -51,8 +51,7 @@ def _run(arguments, console):
     original, warnings = inputs.load_map(settings.input)
     folder = Path(arguments.out or f"{Path(arguments.map).stem}_fit")
     with output_folder.results_in(folder, RESULTS, [arguments.map]):
-        for line in warnings:
-            console.warn(line)
+        console.warn(*warnings)
         _fit(arguments, settings, original, folder, console)
     return 0
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from envedit.cli import map_command
+from envedit.core.errors import counted
 
 RESULTS = ("lights.json", "sky.exr", "lights.exr")
 """What the command leaves in its folder."""
@@ -59,9 +60,8 @@ def _lights(arguments, console):
         manifest.write_json(folder / "lights.json", about)
     files = {name: str(folder / name) for name in RESULTS}
     console.facts |= {"folder": str(folder), "files": files, **about}
-    for line in _table(numbered):
-        console.say(line)
-    console.say(f"{len(numbered)} light{'s' * (len(numbered) != 1)}; results in {folder}")
+    console.say(*_table(numbered))
+    console.say(f"{counted(len(numbered), 'light', 'lights')}; results in {folder}")
 
 
 def _table(lights):

@@ -91,8 +91,7 @@ def read(path: str, arguments: argparse.Namespace, console: Console) -> InputMap
     from envedit.maps import map_file
 
     input_map = map_file.read(path, arguments.repair)
-    for warning in input_map.warnings:
-        console.warn(warning)
+    console.warn(*input_map.warnings)
     return input_map
 
 
@@ -100,5 +99,4 @@ def write(file: Path, stored: np.ndarray, like: InputMap, console: Console) -> N
     """Write a map as of :func:`.map_file.write`, and report its warnings."""
     from envedit.maps import map_file
 
-    for warning in map_file.write(file, stored, like):
-        console.warn(warning)
+    console.warn(*map_file.write(file, stored, like))

@@ -165,10 +165,8 @@ def _write(result, folder, import_s, console, notes):
     from envedit.report import run_folder
     from envedit.report.verdict import verdict
 
-    for line in run_folder.write(folder, result, import_s):
-        console.warn(line)
-    for line in notes:
-        console.say(line)
+    console.warn(*run_folder.write(folder, result, import_s))
+    console.say(*notes)
     console.say(verdict(result.metrics))
     console.say(f"results in {folder.resolve()}")
     _note_results(console, folder)
@@ -210,10 +208,8 @@ def _export_initial(settings, base, file, console):
             warnings += initial_rendering.export(view_file, picture[rows], settings, tonemap)
 
     # ---- What to do with it
-    for line in warnings:
-        console.warn(line)
-    for line in notes:
-        console.say(line)
+    console.warn(*warnings)
+    console.say(*notes)
     declared = settings.target.display_tonemap
     if tonemap not in ("linear", declared):
         console.say(
@@ -252,16 +248,14 @@ def _dry_run(settings, base, console):
             {"initial": target.initial, "target": target.picture},
             {"initial": envmap, "target": target.envmap},
             settings.output.tonemap,
-            [view.rows for view in scene.views],
+            scene.rows,
         )
         write_atomically(picture_file, sheet)
         images.write_exr(radiance_file, target.picture, {"content": "target"}, panorama=False)
     solver = None if settings.newton else "adam"  # a mirror's detail is solved for by Adam, too
-    for line in (*input_map.warnings, *target.warnings, *config.unused(settings, solver)):
-        console.warn(line)
+    console.warn(*input_map.warnings, *target.warnings, *config.unused(settings, solver))
     files = {file.name: str(file.resolve()) for file in (picture_file, radiance_file)}
-    for line in (*inputs.notes(settings.input, scene, input_map), target.source, *files.values()):
-        console.say(line)
+    console.say(*inputs.notes(settings.input, scene, input_map), target.source, *files.values())
     console.facts["files"] = files
     return 0
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from envedit.config.list_schema import LightList, RegionList, StrokeList
-from envedit.config.tables import EDITED, LAYERS, Table, key
+from envedit.config.tables import EDITED, LAYERS, PAINTED, PAINTED_KINDS, Table, key
 from envedit.config.validators import (
     MOST_DIM,
     VIEW,
@@ -32,7 +32,6 @@ TURN_DEGREES = 60.0
 """Turn of the target's map where neither a map nor a turn is given."""
 TARGET_KINDS = ("envmap", "rendering", "photo", "image", "strokes", "none")
 """Kinds of target that are built in."""
-_PAINTED = {"target.kind": ("image", "strokes")}
 _PICTURES = "rendering", "photo", "image"
 _PHOTO = {"target.kind": ("photo",)}
 _SUNSKY = {"input.envmap": ("sunsky", "auto")}
@@ -224,13 +223,13 @@ class Target(Table):
         True, Boolean(), "find by how little the photograph is shifted, scaled and rotated", when=_PHOTO
     )
     strokes: tuple[dict, ...] = key((), StrokeList(), "kind strokes: what is painted on the rendering")
-    paint: float = key(1.0, Number(0), "weight of all that was painted together", when=_PAINTED)
+    paint: float = key(1.0, Number(0), "weight of all that was painted together", when=PAINTED)
     rest: str = key(
         "follow",
         Choice("follow", "keep"),
         "what the pixels do that were not painted: follow the light that the paint requires (shading, "
         "highlights, shadows), with the same mean; or keep their values",
-        when=_PAINTED,
+        when=PAINTED,
     )
     hold: float | str = key(
         "auto",
@@ -238,7 +237,7 @@ class Target(Table):
         "weight of all pixels that were not painted, beside that of paint; auto: 1, but with Gauss-Newton "
         "steps 0.1 where they follow, and where they keep their values as much more than 1 as keeps their "
         "mean change of display values below 0.02",
-        when=_PAINTED,
+        when=PAINTED,
     )
     spp: int | str = key(
         "auto",
@@ -247,6 +246,11 @@ class Target(Table):
         "per pixel",
         EDITED,
     )
+
+    @property
+    def painted(self) -> bool:
+        """Whether a picture is painted on, and not rendered or photographed under other light."""
+        return self.kind in PAINTED_KINDS
 
     @property
     def degrees(self) -> float:
@@ -283,7 +287,7 @@ class Target(Table):
                 "target.file and target.rotate_degrees: got both, expected one: the other map, or the input "
                 'turned; remove one, or set rotate_degrees = "auto"'
             )
-        if self.kind in ("image", "strokes") and not self.paint and self.hold == 0:
+        if self.painted and not self.paint and self.hold == 0:
             raise ConfigError("target.paint, target.hold: got 0 for both, expected one above 0")
         if self.kind == "strokes" and not self.strokes:
             raise ConfigError('target.strokes: got none, expected at least one, as target.kind is "strokes"')

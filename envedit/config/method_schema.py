@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from envedit.config.tables import ADAM_STEPS, EDITED, LAYERS, SIREN, TRANSPORT, Table, key
+from envedit.config.tables import ADAM_STEPS, EDITED, LAYERS, PAINTED, SIREN, TRANSPORT, Table, key
 from envedit.config.validators import WEIGHT, Boolean, Choice, Integer, Number, OrAuto, Ramp, String
 from envedit.core import extensions
 from envedit.core.errors import ConfigError
@@ -182,7 +182,7 @@ class Solve(Table):
         Number(0, 1),
         "painted targets: how far the sky may change beside its lights, in units of how photographed skies "
         "differ; 0: lights, and one factor for the whole sky",
-        when=LAYERS | {"target.kind": ("image", "strokes")},
+        when=LAYERS | PAINTED,
     )
 
 

@@ -6,6 +6,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from envedit.config.tables import PAINTED_KINDS
+
 # Presets are nested dicts of defaults. "paper" is Sec. 6 of the paper, every number of it spelled out even
 # where it is a default today; the path tracer's samples a pixel and the rendering's size are not in it.
 PRESETS: dict[str, dict[str, Any]] = {
@@ -88,7 +90,7 @@ def defaults(preset: str, given: dict[str, Any]) -> dict[str, Any]:
         chosen = overlaid(chosen, MANY_PARAMETERS[preset])
     if kind == "siren":
         chosen = overlaid(chosen, SIREN[preset])
-    if asked.get("target", {}).get("kind", "envmap") in ("image", "strokes"):
+    if asked.get("target", {}).get("kind", "envmap") in PAINTED_KINDS:
         chosen = overlaid(chosen, PAINTED[preset])
     return chosen
 

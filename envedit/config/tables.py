@@ -18,6 +18,9 @@ When = dict[str, tuple[Any, ...]]
 but an empty one or 0. The key ``solver`` is not one of a file: the steps that are made, "gauss-newton" or
 "adam"."""
 
+PAINTED_KINDS = "image", "strokes"
+"""Kinds of target that are painted on a rendering."""
+PAINTED: When = {"target.kind": PAINTED_KINDS}
 EDITED: When = {"target.kind": ("envmap", "rendering", "photo", "image", "strokes")}
 LAYERS: When = {"representation.kind": ("layers",)}
 SIREN: When = {"representation.kind": ("siren",)}

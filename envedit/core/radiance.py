@@ -20,11 +20,18 @@ def any_channel(mask: np.ndarray) -> np.ndarray:
     return mask[..., 0] | mask[..., 1] | mask[..., 2]
 
 
-def require_unmasked(values: ArrayLike, what: str) -> None:
-    """Refuse a masked array of which something is masked, with an InputError: its mask would not be read."""
+def unmasked(values: ArrayLike, what: str) -> np.ndarray:
+    """Return values as an array, of dtype object where they are none, such as rows of different lengths.
+
+    InputError, which begins with ``what``, if something is masked: the mask would not be read.
+    """
     if masked := int(np.count_nonzero(np.ma.getmask(values))):
         values_are = counted(masked, "value is", "values are")
         raise InputError(f"{what}: {values_are} masked, and masks are not read: fill them (ma.filled)")
+    try:
+        return np.asarray(values)
+    except (TypeError, ValueError):
+        return np.asarray(None)
 
 
 def require_radiance(image: ArrayLike, what: str, first_row: int = 0, brightest: float = math.inf) -> None:
@@ -34,8 +41,7 @@ def require_radiance(image: ArrayLike, what: str, first_row: int = 0, brightest:
     map at which the image begins: the message gives rows of the map. InputError with the number of texels of
     the first kind found, the first of them, and what to do.
     """
-    require_unmasked(image, what)
-    image = np.asarray(image)
+    image = unmasked(image, what)
     for bad, how, cure in (
         (~np.isfinite(image), "not finite", "repair the map"),
         (image < 0, "negative", "set them to 0"),

@@ -61,9 +61,7 @@ def carry(
         work.correct(source)
 
     # ---- Apply it to bands of rows
-    result = source.copy()
-    for band in grid.bands():
-        original = source[band.rows]
+    def changed(band, original):
         composed = work.band(band, original)
         if representation.models_edit:
             composed = unseen_kept(original, composed)
@@ -74,8 +72,9 @@ def carry(
                 f"the edit at full resolution is not finite at {place_of(bad, band.start)}; lower "
                 "[optimizer] lr if you have raised it, else scale the map down"
             )
-        result[band.fresh : band.stop] = composed[band.fresh - band.start :]
-    return result
+        return composed
+
+    return grid.composed(source, changed)
 
 
 # ---- Layers ------------------------------------------------------------------------------------------------

@@ -82,8 +82,8 @@ class Ratio:
             return
         least = LEAST * float(self.want.mean())
         for step in range(sum(ROUNDS)):
-            mean = latlong.resize(self._composed(source), self.grid.rows.total, self.grid.columns)
-            mean = mean[self.grid.rows.slice]
+            composed = self.grid.composed(source, self.band)
+            mean = latlong.resize(composed, self.grid.rows.total, self.grid.columns)[self.grid.rows.slice]
             off = np.abs(mean - self.want) > TOLERANCE * np.maximum(self.want, least)
             off &= self.changed[..., None]
             if not off.any():
@@ -97,14 +97,6 @@ class Ratio:
             else:
                 self.fix = (self.fix[0] * m, self.fix[1] * m + a)
                 self.fixed = True
-
-    def _composed(self, source):
-        """Compose the whole source."""
-        result = source.copy()
-        for band in self.grid.bands():
-            composed = self.band(band, source[band.rows])
-            result[band.fresh : band.stop] = composed[band.fresh - band.start :]
-        return result
 
     def band(self, band: Band, source: np.ndarray) -> np.ndarray:
         """Compose the rows of a band, which are ``source``."""

@@ -7,7 +7,7 @@ on the host, where it is small, and across the columns on the device; what is sm
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import drjit as dr
 import mitsuba as mi
@@ -78,6 +78,14 @@ class Places:
         for fresh in range(self.start, self.stop, max(size, 1)):
             start = min(fresh, self.stop - size)
             yield Band(start, start + size, fresh, self.shape[1])
+
+    def composed(self, source: np.ndarray, of_band: Callable[[Band, np.ndarray], np.ndarray]) -> np.ndarray:
+        """Return a source (H, W, 3) with each band (size, W, 3) as a function makes it of the band."""
+        result = source.copy()
+        for band in self.bands():
+            changed = of_band(band, source[band.rows])
+            result[band.fresh : band.stop] = changed[band.fresh - band.start :]
+        return result
 
     def linear(self, kind: type[DrArray], band: Band, values: np.ndarray) -> DrArray:
         """Interpolate values (rows, w, C) linearly at the texels of a band; ``kind`` has C components."""

@@ -53,10 +53,8 @@ def write_report(path: FilePath, result: Result, manifest: dict) -> None:
     # ---- What is shown
     metrics = plain(result.metrics, "", [])
     tonemap = settings.output.tonemap
-    renders = preview.known(result.shown)
     maps = preview.known(result.maps)
-    names = list(dict.fromkeys([*result.renders, *result.maps]))
-    by_view = _by_view(renders, result.views)
+    by_view = _by_view(result.shown, result.views)
 
     warnings = result.warnings
     source = result.input_map.source if result.input_map else settings.input.envmap
@@ -70,7 +68,7 @@ def write_report(path: FilePath, result: Result, manifest: dict) -> None:
         f"<title>{title}</title><style>{parts.STYLE}</style></head><body>",
         f'<h1>{title}</h1><p class="verdict">{escape(verdict(metrics))}</p>',
         f'<div class="warnings"><strong>Warnings</strong>{parts.listing(warnings)}</div>' if warnings else "",
-        _pictures(names, by_view, maps, tonemap),
+        _pictures(list(result.maps), by_view, maps, tonemap),
         _section("Differences", _differences(by_view, maps, tonemap), 2),
         _section("Lights and background", parts.lights_figure(maps["edited"], result.lights, tonemap), 1),
         _section("", _separation(result.separation, tonemap)),
@@ -179,10 +177,9 @@ def _painted(result):
     if result.reach is None:
         return []
     codes = np.rint(255 * preview.unreachable(result.reach)).astype(np.uint8)
-    views = [view.rows for view in result.views] if len(result.views) > 1 else [slice(None)]
     caption = f"what is not feasible; {100 * result.reach.share:.0f} % of the painted change is feasible"
     words = parts.scale(("marked red: stays darker than painted", "marked blue: brighter"))
-    return [parts.figure(codes[rows], caption, words) for rows in views]
+    return [parts.figure(codes[rows], caption, words) for rows in result.rows or (slice(None),)]
 
 
 def _photograph(result):

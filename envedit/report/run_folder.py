@@ -59,8 +59,7 @@ def write(folder: Path, result: results.Result, import_s: float) -> list[str]:
     timing["import_s"] = round(import_s, 3)
     timing["total_s"] = round(timing["total_s"] + timing["import_s"] + timing["full_s"], 3)
     if settings.output.report:
-        views = [view.rows for view in result.views]
-        sheet = preview.sheet(result.shown, result.maps, settings.output.tonemap, views)
+        sheet = preview.sheet(result.shown, result.maps, settings.output.tonemap, result.rows)
         atomic_files.write_atomically(folder / "preview.png", sheet)
         html_report.write_report(folder / "report.html", result, facts)
     timing["report_s"] = round(time.perf_counter() - maps_written, 3)
@@ -143,9 +142,8 @@ def _write_maps(folder, result):
 
 def _write_renderings(folder, result):
     """Write the renderings, and each view of them where there are several."""
-    views = [view.rows for view in result.views]
     for name, picture in result.renders.items():
-        for file, rows in output_folder.of_views(f"render_{name}.exr", views):
+        for file, rows in output_folder.of_views(f"render_{name}.exr", result.rows):
             alpha = None if result.alpha is None else result.alpha[rows]
             source = {"source": result.settings.scene.file}
             images.write_exr(folder / file, picture[rows], source, panorama=False, alpha=alpha)

@@ -60,8 +60,8 @@ def encoded(
         fitted = make(settings, folder, progress, rows)
         return fitted, fitted.encode(image, settings.seed)
     # Towards a rendering an added light may be a haze, or stand where the map has a sun with a glow.
-    painted = settings.target.kind in ("image", "strokes")
-    layers = layers_of(image, settings, rows, horizon, aureoles=painted, fixed=fixed, kept=kept)
+    aureoles = settings.target.painted
+    layers = layers_of(image, settings, rows, horizon, aureoles=aureoles, fixed=fixed, kept=kept)
     return layers, layers.start()
 
 

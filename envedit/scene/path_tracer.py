@@ -48,7 +48,7 @@ class PathTracer:
         one_thread: bool = True,
     ):
         self.scene, self.one_thread = scene, one_thread
-        self.spp = _whole(scene, AUTO_SPP if isinstance(spp, str) else spp)
+        self.spp = _filling_the_sampler(scene, AUTO_SPP if isinstance(spp, str) else spp)
         if self.spp * scene.width * scene.height > _MOST_SAMPLES:
             raise ConfigError(
                 f"renderer.spp: {self.spp} samples of {scene.width}x{scene.height} pixels are more than one "
@@ -120,7 +120,7 @@ class _Rendering(dr.CustomOp):
         return "path tracing"
 
 
-def _whole(scene, spp):
+def _filling_the_sampler(scene, spp):
     """Round up to the counts of Mitsuba's multijitter, which else warns at every step."""
     if scene.mi.sensors()[0].sampler().class_name() != "MultijitterSampler":
         return spp

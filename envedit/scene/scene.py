@@ -38,7 +38,7 @@ from envedit.core import installed_plugins, latlong, shipped
 from envedit.core.color import tonemap
 from envedit.core.errors import ConfigError, EnveditError, InputError, NumericalError, texels_are
 from envedit.core.quiet_libraries import quiet_libraries
-from envedit.core.radiance import require_unmasked
+from envedit.core.radiance import unmasked
 from envedit.core.types import ArrayLike, FilePath
 from envedit.scene import film, parser, scene_files, scene_text, supported, vertex_normals
 from envedit.scene.scene_files import SceneFile
@@ -96,7 +96,7 @@ class Scene:
         What of the file is not used, or used otherwise.
     parameters : dict
         Values that were filled in for the ``$names`` of the XML.
-    again : callable or None
+    resized : callable or None
         Loads it with a film of another (width, height), in pixels, height 0 by the aspect; errors as of
         :func:`load`. None of a scene that was not loaded from a file or dict.
     files : tuple of str
@@ -116,7 +116,7 @@ class Scene:
     integrator: supported.Integrator = supported.Integrator()
     notes: tuple[str, ...] = ()
     parameters: dict[str, str | float | bool] = field(default_factory=dict)
-    again: Callable[[int, int], Scene] | None = None
+    resized: Callable[[int, int], Scene] | None = None
     files: tuple[str, ...] = ()
 
     @functools.cached_property
@@ -144,8 +144,7 @@ class Scene:
         InputError if the shape is not that of a map. NumericalError if a texel is not finite or is negative
         in float32: one such texel spoils every lit pixel.
         """
-        require_unmasked(image, "environment map")
-        image = np.asarray(image)
+        image = unmasked(image, "environment map")
         if image.ndim != 3 or image.shape[2] != 3 or not np.issubdtype(image.dtype, np.number):
             what = f"shape {image.shape} of {image.dtype}"
             raise InputError(f"environment map: got {what}, expected (H, W, 3) numbers")
@@ -326,10 +325,6 @@ def load(
     vertex_normals.summed_in_order(params)
     key = next(k for k, _ in params if k.split(".")[-2:] == [name, "data"])
     columns, views = views_of(scene, names)
-
-    def again(width: int, height: int) -> Scene:
-        return load(file, width, height, parameters, base, sampler, sensors, up, scale)
-
     return Scene(
         scene,
         parsed.path,
@@ -344,7 +339,7 @@ def load(
         integrator=integrator,
         notes=notes,
         parameters=dict(parameters or {}),
-        again=again,
+        resized=lambda wide, high: load(file, wide, high, parameters, base, sampler, sensors, up, scale),
         files=tuple(read),
     )
 

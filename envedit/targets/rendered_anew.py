@@ -60,9 +60,7 @@ def noise(picture: np.ndarray, views: Views = (slice(None),)) -> np.ndarray:
     return np.full(picture.shape[:2], np.sqrt(np.quantile(squares, 0.25)))
 
 
-def samples(
-    picture: np.ndarray, known: np.ndarray, initial: np.ndarray, spp: int, views: Views = (slice(None),)
-) -> int:
+def samples(known: np.ndarray, initial: np.ndarray, spp: int, views: Views = (slice(None),)) -> int:
     """Return how many samples a pixel a picture of the scene seems to have been rendered with.
 
     By its noise (``known``, of :func:`noise`) and that of an ``initial`` rendering (h, w, 3) of the same

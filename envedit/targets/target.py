@@ -131,12 +131,11 @@ def make(
     :data:`.radiance.BRIGHTEST`; a picture that is so bright is cut there, with a warning. ConfigError if a
     view is not the scene's, or is given twice, or strokes paint nothing; as of :func:`.extensions.load`.
     """
-    hidden = hidden_pixels(scene)
-    made = _made(settings, scene, envmap, replacements, hidden)
-    return _seen(made, hidden, settings.output.tonemap)
+    made = _made(settings, scene, envmap, replacements)
+    return _seen(made, hidden_pixels(scene), settings.output.tonemap)
 
 
-def _made(settings, scene, envmap, replacements, hidden):
+def _made(settings, scene, envmap, replacements):
     """Make the target, without regard to pixels that see no surface where nothing was painted."""
     # ---- The scene under another map
     chosen = settings.target
@@ -160,10 +159,10 @@ def _made(settings, scene, envmap, replacements, hidden):
             )
         return _of_rendering(settings, scene, envmap, picture, mask)
 
-    return _of_paint(settings, scene, envmap, picture, mask, hidden)
+    return _of_paint(settings, scene, envmap, picture, mask)
 
 
-def _of_paint(settings, scene, envmap, picture, mask, hidden):
+def _of_paint(settings, scene, envmap, picture, mask):
     """Take what was painted on the initial rendering; a picture that was rendered anew is one of a scene."""
     # ---- The picture
     chosen = settings.target
@@ -178,8 +177,7 @@ def _of_paint(settings, scene, envmap, picture, mask, hidden):
         painted = painted_strokes(scene, initial, chosen.strokes, chosen.display_tonemap)
         if not painted.coverage.any():
             raise ConfigError("; ".join(painted.warnings))
-        count = len(chosen.strokes)
-        source = f"painted: {count} stroke{'s' * (count != 1)} on the initial rendering"
+        source = f"painted: {counted(len(chosen.strokes), 'stroke', 'strokes')} on the initial rendering"
     if chosen.kind == "image" and mask is None and not chosen.masks:
 
         def again():
@@ -197,6 +195,7 @@ def _of_paint(settings, scene, envmap, picture, mask, hidden):
         warnings += (f"target: {pixels_are} brighter than {BRIGHTEST:.3g}: taken as that bright",)
 
     # ---- How much each pixel counts
+    hidden = hidden_pixels(scene)
     coverage = np.where(hidden[..., None], 0, painted.coverage)
     if painted.coverage.any() and not coverage.any():
         raise InputError(
@@ -243,7 +242,7 @@ def _of_rendering(settings, scene, envmap, picture, mask, how=""):
     picture = np.minimum(image.picture, np.float32(BRIGHTEST))
     noise = rendered_anew.noise(picture, scene.rows)
     initial, spp, _ = with_noise(settings, scene, envmap)
-    spp = rendered_anew.samples(picture, noise, initial, spp, scene.rows)
+    spp = rendered_anew.samples(noise, initial, spp, scene.rows)
     source += f"{how}, as noisy as {spp} samples a pixel"
     made = Target(picture, image.coverage, None, source, image.warnings, asked=asked, noise=noise, spp=spp)
     return replace(made, clipped=image.clipped)
@@ -276,7 +275,7 @@ def _of_photo(settings, scene, envmap, picture, mask):
 
     # ---- Its noise
     noise = rendered_anew.noise(target.picture, scene.rows)
-    spp = rendered_anew.samples(target.picture, noise, initial, spp, scene.rows)
+    spp = rendered_anew.samples(noise, initial, spp, scene.rows)
     return replace(target, noise=noise, spp=spp)
 
 

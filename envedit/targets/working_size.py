@@ -52,11 +52,11 @@ def smaller(settings: config.Config, scene: Scene, painted: bool = False) -> Sce
 
 def scaled(scene: Scene, factor: float) -> Scene | None:
     """Return the scene on a film that is ``factor`` times as wide and high; None if it is built already."""
-    if scene.again is None:
+    if scene.resized is None:
         return None
     heights = {rows.stop - rows.start for rows in scene.rows}
     height = max(1, round(factor * heights.pop())) if len(heights) == 1 else 0  # 0: by each view's aspect
-    return scene.again(max(4, round(factor * scene.width)), height)
+    return scene.resized(max(4, round(factor * scene.width)), height)
 
 
 def worked_on(
@@ -79,7 +79,7 @@ def worked_on(
             if target.clipped is not None:
                 target = replace(target, clipped=at_size(target.clipped, scene, small) > 0)
             noise = rendered_anew.noise(picture, small.rows)
-            spp = rendered_anew.samples(picture, noise, *with_noise(settings, small, envmap)[:2], small.rows)
+            spp = rendered_anew.samples(noise, *with_noise(settings, small, envmap)[:2], small.rows)
         else:
             picture, spp, noise = with_noise(settings, small, target.envmap)
         weight = np.where(hidden[..., None], 0, at_size(target.weight, scene, small)).astype(np.float32)

@@ -206,7 +206,7 @@ class ColumnStore:
 
     def _add_vertices(self, block, texels, slots, count):
         """Add what a block of paths contributes to columns by way of its vertices."""
-        value, lost = path_vertices.contributions(self.scene.mi, self.grid, block, texels, count, self.seed)
+        value, lost = path_vertices.column_values(self.scene.mi, self.grid, block, texels, count, self.seed)
         self._lost += lost
         place = self._places(slots, block.pixels, dr.opaque(mi.UInt32, block.first)) * 4
         for c in range(3):  # whatever the slot held before is overwritten

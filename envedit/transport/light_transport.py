@@ -29,7 +29,7 @@ from envedit.core import latlong, seeds
 from envedit.core.array_cache import DiskCache, under
 from envedit.core.arrays import tensor
 from envedit.core.errors import InputError, counted
-from envedit.core.radiance import require_radiance, require_unmasked
+from envedit.core.radiance import require_radiance, unmasked
 from envedit.core.types import ArrayLike, Progress
 from envedit.scene import built_scene
 from envedit.scene.scene import Scene
@@ -563,11 +563,7 @@ def _as_tensor(values, shape, what):
 
 def _as_array(values: ArrayLike, shape: tuple[int, ...], what: str) -> np.ndarray:
     """Return a map or a picture as an array; InputError where it has another shape or holds no numbers."""
-    require_unmasked(values, "light transport")
-    try:
-        array = np.asarray(values)
-    except (TypeError, ValueError):  # rows of different lengths
-        array = np.asarray(None)
+    array = unmasked(values, "light transport")
     if array.dtype.kind not in "fiub":
         kind = type(values).__name__
         raise InputError(f"light transport: the {what} must be an array of numbers, got {kind}")

@@ -191,7 +191,7 @@ def on_device(kind: type[DrArray], values: np.ndarray) -> DrArray:
     return dr.opaque(kind(np.ascontiguousarray(values if len(values) > 1 else np.repeat(values, 2))))
 
 
-def contributions(
+def column_values(
     scene: mi.Scene, grid: Grid, block: Block, texels: np.ndarray, count: int, seed: int
 ) -> tuple[mi.Color3f, mi.UInt32]:
     """Return what each of some ``texels`` (k,) adds to the pixels of a block by way of its vertices.

@@ -1,5 +1,6 @@
 """envedit from Python: arrays, dicts and built scenes in, a result that shows and saves itself out."""
 
+import dataclasses
 import inspect
 import os
 import runpy
@@ -299,6 +300,8 @@ def test_an_object_is_put_into_a_photograph_under_its_light(tmp_path, monkeypatc
     maps = found["sky"], result.envmap
     before, after = (luminance(map_lights.irradiance(sky, list(map_lights.AXES.values()))) for sky in maps)
     assert np.log(after / before).mean() == pytest.approx(0, abs=1e-4)
+    result.posterior = dataclasses.replace(result.posterior, sample=lambda rng: result.found.params)
+    np.testing.assert_allclose(result.samples(1)[0], result.envmap, rtol=1e-5)
 
     # ---- What is written
     saved = images.read_stored(tmp_path / "matched" / "photograph.png")[0]

@@ -63,22 +63,6 @@ def test_a_second_build_traces_nothing_and_gives_the_same_bits(lamp, tmp_path, r
     assert (np.abs(first.apply(dr.zeros(mi.TensorXf, (8, 16, 3))).numpy()).max() > 0) == lamp
 
 
-@pytest.mark.slow
-def test_what_was_lost_is_told_from_disk_as_well(lit, tmp_path, monkeypatch):
-    real = recording.contributions
-
-    def spoiled(*arguments):
-        for bounce, pixel, texel, value in real(*arguments):
-            first = dr.arange(mi.UInt32, len(pixel)) == 0
-            yield bounce, pixel, texel, dr.select(first, float("nan"), value)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(recording, "contributions", spoiled)
-        first = build(tmp_path, lit)
-    second = build(tmp_path, lit)
-    assert second.cached and second.choices == first.choices and "not finite" in second.choices[-1]
-
-
 CHANGES = ({"seed": 1}, {"spp": 8}, {"max_depth": 2}, {"height": 9, "width": 16})
 
 

@@ -46,6 +46,7 @@ def edges(check):
 
 
 LIGHTS = [{"azimuth": 1, "elevation": 2, "flux": [1, 2, 3]}]
+SOFT = [LIGHTS[0] | more for more in ({"softness": 0.5}, {"softness": 0.5, "shape": "disc"}, {"softness": 0})]
 # What JSON Schema cannot say of a value by itself: rows in order, and what is refused with the name of a key
 # inside.
 LOOSER = {"input.rows", "input.lights", "target.strokes"}
@@ -147,7 +148,10 @@ def test_the_page_is_what_is_generated(capsys):
     ({"input": {"azimuth": 3}}, None, []),
     ({"input": {"lights": LIGHTS, "horizon": "keep", "rows": "upper"}}, None, []),  # they use the horizon
     ({"input": {"rows": "upper", "horizon": "keep"}}, None, ["horizon: no effect: needs input.rows"]),
+    ({"input": {"lights": SOFT}}, None, ['lights[0].softness: no effect: needs shape other than "gaussian"']),
     ({"target": {"paint": 2}}, None, ["target.paint: no effect: needs target.kind"]),
+    ({"target": {"tonemap": "gamma"}}, None, ["target.tonemap: no effect"]),
+    ({"target": {"tonemap": "gamma", "file": "b.png"}}, None, []),  # which may be a picture
     ({"perceptual": {"vgg": "a", "dists": "b"}}, None, ["perceptual.dists, perceptual.vgg: no effect"]),
     ({"target": {"kind": "none"}, "optimizer": {"iterations": 3}}, None, ['other than "none"']),
     ({"target": {"kind": "none"}, "renderer": {"cache": False}, "output": {"spp": 3}}, None, []),

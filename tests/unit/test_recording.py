@@ -42,7 +42,7 @@ def test_contributions_that_are_not_finite_are_left_out_and_counted(monkeypatch)
 
 
 @pytest.mark.slow
-def test_transport_says_how_many_were_left_out(monkeypatch):
+def test_transport_says_how_many_were_left_out(tmp_path, monkeypatch):
     s = scene.load("matte", 8, 8)
     options = {"spp": 4, "max_depth": 2, "memory_gb": 0.1}
     clean = LightTransport.build(s, 4, 8, **options)
@@ -54,11 +54,14 @@ def test_transport_says_how_many_were_left_out(monkeypatch):
         for bounce, pixel, texel, value in real(*arguments):
             yield bounce, pixel, texel, dr.select(dr.arange(mi.UInt32, len(pixel)) == 0, NAN, value)
 
-    monkeypatch.setattr(recording, "contributions", spoiled)
-    t = LightTransport.build(s, 4, 8, **options)
-    assert left_out(t) == [3]
+    with monkeypatch.context() as patch:
+        patch.setattr(recording, "contributions", spoiled)
+        t = LightTransport.build(s, 4, 8, folder=tmp_path, **options)
+        assert left_out(t) == [3]
+        assert left_out(t.recorded_again(1)) == [6]  # another recording: one line still, with the sum
     assert np.isfinite(t.apply(dr.ones(mi.TensorXf, (4, 8, 3))).numpy()).all()
-    assert left_out(t.recorded_again(1)) == [6]  # another recording: one line still, with the sum
+    kept = LightTransport.build(s, 4, 8, folder=tmp_path, **options)
+    assert kept.cached and kept.choices == t.choices
 
 
 def left_out(transport):

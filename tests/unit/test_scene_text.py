@@ -52,12 +52,6 @@ def test_what_mitsuba_reads_without_looking_must_be_there(tmp_path, part, says):
     refused(write_scene(tmp_path, SENSOR, LIGHT, part), says)
 
 
-def test_what_is_included_and_no_xml_is_told_with_the_scene(tmp_path):
-    (tmp_path / "passwd").write_text("root:x:0:0")
-    message = refused(write_scene(tmp_path, SENSOR, LIGHT, '<include filename="passwd"/>'), "is no XML file")
-    assert str(tmp_path / "test.xml") in message and str(tmp_path / "passwd") in message
-
-
 @pytest.mark.parametrize("name", ["test.xml", "x/../test.xml", "./x/.././x/../test.xml"])
 def test_an_include_of_itself_is_refused(tmp_path, name):
     (tmp_path / "x").mkdir()
@@ -103,7 +97,9 @@ def test_what_is_no_xml_is_told_soon_and_without_its_text(tmp_path, text, says):
     (tmp_path / "test.xml").write_text(text)
     assert "root:" not in refused(tmp_path / "test.xml", says)
     included = write_scene(tmp_path, SENSOR, LIGHT, '<include filename="test.xml"/>', name="outer.xml")
-    assert "root:" not in refused(included, says)
+    message = refused(included, says)
+    assert "root:" not in message and str(tmp_path / "test.xml") in message
+    assert str(included) in message or says != "is no XML file"
 
 
 def test_sizes_are_bounded(tmp_path, monkeypatch):

@@ -110,9 +110,10 @@ def test_strokes_lie_on_the_initial_rendering_and_beside_it_are_refused(ball, se
     np.testing.assert_allclose(made.picture[3:9, 4:12], 0.5 * initial[3:9, 4:12], rtol=1e-6)
     np.testing.assert_array_equal(made.picture[:3], initial[:3])
     assert made.envmap is None and made.asked == () and "1 stroke on" in made.source
-    with pytest.raises(ConfigError, match=r"target\.strokes"):
-        beside = a_stroke(rectangle=[3, 3, 4, 4])
-        target.make(asking(kind="strokes", strokes=(beside,)), ball, seen[0])
+    says = r"target\.strokes\[0\] \(shadow\): lies outside .*; target\.strokes\[1\] \(shadow\): opacity 0"
+    with pytest.raises(ConfigError, match=says):
+        nothing = a_stroke(rectangle=[3, 3, 4, 4]), a_stroke(opacity=0)
+        target.make(asking(kind="strokes", strokes=nothing), ball, seen[0])
 
 
 def test_an_array_asks_what_its_file_would(ball, seen, tmp_path):
@@ -202,9 +203,9 @@ def test_a_picture_of_the_scene_is_read_as_linear_radiance(ball, pictured, tmp_p
     assert (np.abs(srgb.picture - picture) < 1.5 * step).all() and (srgb.weight == 1).all()
     named = of_a_picture(ball, pictured, file=str(tmp_path / "a.png"), tonemap="gamma")
     np.testing.assert_allclose(named.picture, (shown_as_srgb(picture) / 255) ** 2.2, rtol=1e-4)
-    array = target.make(
-        asking(kind="rendering", file=images.ARRAY), ball, envmap, Replacements(target=picture)
-    )
+    with pytest.raises(ConfigError, match="expected the picture of the scene"):
+        target.make(asking(kind="rendering"), ball, envmap)
+    array = target.make(asking(kind="rendering"), ball, envmap, Replacements(target=picture))
     np.testing.assert_array_equal(array.picture, picture)
     assert "given as an array" in array.source and (array.weight == 1).all()
 
@@ -324,14 +325,6 @@ def test_paint_beside_the_object_does_not_count(tmp_path, rng):
     file = str(png(tmp_path / "white.png", np.where(hidden[..., None], 255, 100).astype(np.uint8)))
     backed = target.make(asking(kind="rendering", file=file), ball, envmap)
     assert backed.clipped[hidden].all() and not backed.weight[hidden].any() and backed.weight[~hidden].all()
-
-
-def test_a_picture_of_the_scene_needs_a_file_or_an_array(ball, seen):
-    settings = asking(kind="rendering")
-    with pytest.raises(ConfigError, match="expected the picture of the scene"):
-        target.make(settings, ball, seen[0])
-    made = target.make(settings, ball, seen[0], Replacements(target=seen[1]))
-    assert made.coverage is None and made.picture.tobytes() == np.float32(seen[1]).tobytes()
 
 
 def test_what_is_asked_for_beside_a_rendering_is_asked_for_beside_that_of_the_transport():

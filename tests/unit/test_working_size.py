@@ -24,6 +24,8 @@ def settings(**tables):
 
 @pytest.mark.parametrize(("tables", "most"), [
     ({}, working_size.PIXELS),
+    ({"target": {"kind": "image", "file": "a.exr"}}, working_size.PAINTED_PIXELS),
+    ({"target": {"kind": "image", "file": "a.exr"}, "renderer": {"pixels": 100}}, 100),
     ({"renderer": {"pixels": 100}, "representation": {"kind": "pixels"}}, 100),
     ({"representation": {"kind": "siren"}}, None),
     ({"optimizer": {"kind": "adam"}}, None),
@@ -32,12 +34,8 @@ def settings(**tables):
     ({"representation": {"cycles": 48}}, None),
 ])  # fmt: skip
 def test_only_gauss_newton_is_solved_on_fewer_pixels_unless_they_are_asked_for(tables, most):
-    assert working_size.most_pixels(config.from_dict(tables)) == most
-
-
-def test_paint_is_solved_on_fewer_pixels_unless_they_are_asked_for():
-    assert working_size.most_pixels(config.Config(), painted=True) == working_size.PAINTED_PIXELS
-    assert working_size.most_pixels(settings(), painted=True) == 150
+    made = config.from_dict(tables)
+    assert working_size.most_pixels(made, made.target.painted) == most
 
 
 def test_a_large_film_is_made_smaller_and_keeps_its_aspect():

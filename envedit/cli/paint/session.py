@@ -660,7 +660,7 @@ class Session:
         result, warnings = self._carried_out(settings, folder, stage)
 
         # ---- What was saved, no less sharp than what is shown, and how it differs
-        saved, rows = result.maps["edited"], tuple(view.rows for view in result.views)
+        saved, rows = result.maps["edited"], result.rows
         rendering = result.renders["edited"]
         passed = self._pass(0, saved)
         if passed.shape[1] > rendering.shape[1]:

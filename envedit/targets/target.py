@@ -113,7 +113,7 @@ def beside(seen: np.ndarray, rendering: np.ndarray, picture: np.ndarray) -> np.n
     """
     less = np.minimum(picture, rendering)
     factor = np.divide(less, rendering, out=np.ones_like(less), where=rendering > 0)
-    return (factor * seen + picture - less).astype(np.float32)
+    return (factor * seen + (picture - less)).astype(np.float32)
 
 
 def make(

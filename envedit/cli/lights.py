@@ -52,7 +52,7 @@ def _lights(arguments, console):
     numbered = [{"id": i + 1, **light} for i, light in enumerate(listed)]
     up = np.array([[0.0, 1.0, 0.0]])
     about = {"map": arguments.map, "width": shape[1], "height": shape[0], "lights": numbered}
-    about["sky_irradiance"] = map_lights.irradiance(sky, up)[0].tolist()
+    about["sky_irradiance"] = map_lights.irradiance(replace(input_map, stored=sky).radiance, up)[0].tolist()
     with output_folder.results_in(folder, RESULTS, [arguments.map]):
         marks = {"source": arguments.map}
         images.write_exr(folder / "sky.exr", sky, marks, chromaticities=input_map.chromaticities)

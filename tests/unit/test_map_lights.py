@@ -64,6 +64,16 @@ def test_the_list_has_direction_flux_and_stops(rng, tmp_path, capsys):
     assert abs(light["stops"] - math.log2(0.715 * 5000 * omega / (math.pi * 0.6))) < 0.1
 
 
+def test_irradiance_of_the_sky_is_in_rec709_as_flux_is(rng, tmp_path, capsys):
+    envmap = sunny(rng)
+    written(envmap, tmp_path, "a.exr")
+    plain = json.loads(capsys.readouterr().out)
+    acescg = envmap @ np.linalg.inv(primaries.to_rec709(primaries.ACES_AP1)).T
+    written(acescg.astype(np.float32), tmp_path, "b.exr", chromaticities=primaries.ACES_AP1)
+    wide = json.loads(capsys.readouterr().out)
+    np.testing.assert_allclose(wide["sky_irradiance"], plain["sky_irradiance"], rtol=1e-3)
+
+
 def test_bands_of_a_large_map_hold_the_lights_of_the_whole(rng):
     envmap = latlong.resize(sunny(rng), 300, 600)
     apart = file_lights.lights_of(envmap)

@@ -53,6 +53,7 @@ def _apply(arguments, console):
 
     # ---- Map by map, each read once
     doctor.select()
+    light = " to ".join(names)
     console.facts["files"] = []
     for source, targets in zip(maps, files, strict=True):
         input_map = map_command.read(source, arguments, console)
@@ -61,7 +62,7 @@ def _apply(arguments, console):
             edited = look_transfer.apply(input_map.radiance, selected[-1], amount, start)
             map_command.write(path, input_map.as_stored(edited), input_map, console)
             console.facts["files"].append({"map": source, "file": str(path), "amount": amount})
-            console.say(f"{path}: {source} in the light of {names[-1]}, amount {amount:.3g}")
+            console.say(f"{path}: {source} in the light of {light}, amount {amount:.3g}")
 
 
 def _amounts(arguments, names, maps):

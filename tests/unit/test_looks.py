@@ -162,6 +162,11 @@ def test_the_command_writes_maps_of_the_files_own_size_and_format(tmp_path, here
     assert "evening_applied/a.exr: exists already: give another folder" in capsys.readouterr().err
     assert cli.main(["apply", "evening.toml", "a.exr", "--out", "b.hdr"]) == 3  # a file, where a folder goes
     assert cli.main(["apply", "evening.toml", "a.exr", "--frames", "2", "--out", "frames"]) == 0
+    looks.write("noon.toml", EVENING)
+    between = ["noon.toml", "evening.toml", "b.hdr", "--amount", "0", "--out", "between"]
+    capsys.readouterr()
+    assert cli.main(["apply", *between]) == 0
+    assert "b.hdr in the light of noon.toml to evening.toml, amount 0" in capsys.readouterr().out
     frames = [images.read(f"frames/a_{i:04d}.exr")[0] for i in (1, 2)]
     assert np.array_equal(frames[0], images.read("a.exr")[0]) and not np.allclose(*frames)
     for wrong, message in (

@@ -112,7 +112,7 @@ class _LayersAt:
         self.strength = flat(mi.Float, np.concatenate([strength, np.ones((1, 3))]).astype(np.float32))
         self.cores = SourceCores(layers, grid, self.edge)
         self.moved = MovedLights(layers, grid.shape, turn, flux, size)
-        self._leaving = np.flatnonzero((turn[:own] != 0).any(axis=1) | (size[:own] != 0).any(axis=1))
+        self._leaving = np.flatnonzero(lights.moved(turn[:own], size[:own]))
 
     def collect(self, source):
         """Gather the texels of lights that move, and place them."""

@@ -64,8 +64,8 @@ class _Texels(NamedTuple):
 
     directions: mi.Vector3f
     base: mi.Color3f
-    # What each light hides, :attr:`.Separation.hidden`; and which light, an index, a texel is of
-    hidden: mi.Color3f
+    # What the lights hide, :attr:`.Light.hidden`, None: nothing; and which light, an index, a texel is of
+    hidden: mi.Color3f | None
     light: mi.UInt32
     fields: Fields
 
@@ -250,7 +250,7 @@ class Layers:
         """Compose the rows above the horizon, by default with the fields of the parameters."""
         texels = self._texels
         base = texels.base
-        if self.separation.hidden.any():
+        if texels.hidden is not None:
             own = slice(self.lights.own)
             left = staying(*(dr.detach(real[name]).numpy()[own] for name in ("turn", "flux", "size")))
             uncovered = flat(mi.Float, np.maximum(1 - left @ LUMINANCE, 0).astype(np.float32))
@@ -310,16 +310,17 @@ class Layers:
             )
         free = None if self.free is None else dr.opaque(mi.Float(np.float32(self.free.ravel())))
         kept = None if self.kept is None else dr.opaque(mi.Float(self.kept[:height].ravel()))
-        hidden = self.separation.hidden
-        if self.kept is not None:
-            hidden = hidden * (1 - self.kept[:height, :, None])
+        hidden = np.zeros((height * width, 3))
         light = np.zeros(height * width, np.uint32)
         for i, one in enumerate(self.separation.lights):
+            hidden[one.texels] = one.hidden
             light[one.texels] = i
+        if self.kept is not None:
+            hidden *= 1 - self.kept[:height].reshape(-1, 1)
         return _Texels(
             directions=directions,
             base=vectors(mi.Color3f, self.base),
-            hidden=vectors(mi.Color3f, hidden),
+            hidden=vectors(mi.Color3f, hidden) if hidden.any() else None,
             light=dr.opaque(mi.UInt32(light)),
             fields=Fields(glows=glows, share=free, kept=kept),
         )

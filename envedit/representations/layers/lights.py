@@ -351,13 +351,17 @@ def flux_factor(log_flux: np.ndarray) -> np.ndarray:
     return np.where(log_flux <= DARK, 0, np.exp(np.minimum(log_flux, MOST_LOG_FLUX)))
 
 
+def moved(turn: np.ndarray, log_size: np.ndarray) -> np.ndarray:
+    """Say which lights are elsewhere or of another size, bool (n,); parameters as of :func:`staying`."""
+    return (turn != 0).any(axis=1) | (log_size != 0).any(axis=1)
+
+
 def staying(turn: np.ndarray, log_flux: np.ndarray, log_size: np.ndarray) -> np.ndarray:
     """Return what of lights is where they were, (n, 3), a factor of their flux: 0 of those that have moved.
 
     ``turn``, ``log_flux`` (n, 3) and ``log_size`` (n, 1) are as for :meth:`Lights.core`.
     """
-    moved = (turn != 0).any(axis=1) | (log_size != 0).any(axis=1)
-    return np.where(moved[:, None], 0, flux_factor(log_flux))
+    return np.where(moved(turn, log_size)[:, None], 0, flux_factor(log_flux))
 
 
 def log_flux_of(factor: ArrayLike) -> np.ndarray:

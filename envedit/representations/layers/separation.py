@@ -89,14 +89,12 @@ class Light:
 
 @dataclass(frozen=True)
 class Separation:
-    """A separated map; ``background * glow + core - hidden`` is the map to float precision."""
+    """A separated map: ``background * glow + core``, less what lights hide, is the map to float precision."""
 
-    # background, glow, core, hidden: (rows, W, 3): B, the product of 1 + G over all lights, the sum of all
-    # cores, and what these hide
+    # background, glow, core: (rows, W, 3): B, the product of 1 + G over all lights, and the sum of all cores
     background: np.ndarray
     glow: np.ndarray
     core: np.ndarray
-    hidden: np.ndarray
     lights: list[Light] = field(default_factory=list)  # those with most flux first
     # Where the lights were found, to find the same lights in another resolution of the map; None without
     survey: Survey | None = None
@@ -160,8 +158,7 @@ def separate(
     if survey is None:
         survey = survey_of(image, rows, most)
     if survey is None:
-        nothing = np.zeros_like(image)
-        return Separation(image, np.ones_like(image), nothing, nothing, [])
+        return Separation(image, np.ones_like(image), np.zeros_like(image), [])
 
     # ---- Glow, cores and background at the map's own resolution
     row, column = _places(survey, (height, width), (first, total))
@@ -196,7 +193,7 @@ def separate(
         for i in kept
     ]
     survey = replace(survey, label=number[survey.label], centres=centres, glows=glows)
-    return Separation(background, glow, core, hidden, lights, survey)
+    return Separation(background, glow, core, lights, survey)
 
 
 def glow_of(survey: Survey, directions: np.ndarray) -> np.ndarray:

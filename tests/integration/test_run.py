@@ -326,6 +326,15 @@ def test_a_finished_run_whose_input_has_changed_is_not_complete(tmp_path, rng, c
 
 
 @pytest.mark.slow
+def test_a_configuration_in_its_own_folder_is_kept_by_a_first_run_that_resumes(tmp_path, rng):
+    path = world(tmp_path, rng, **PIXELS)
+    written = path.read_bytes()
+    path = path.rename(tmp_path / "config.toml")
+    assert call(path, "--resume", "--quiet", "--out", tmp_path, *changed(optimizer__iterations=1)) == 0
+    assert path.read_bytes() != written and (tmp_path / "earlier-1" / "config.toml").read_bytes() == written
+
+
+@pytest.mark.slow
 def test_ctrl_c_inside_an_operation_is_ctrl_c(tmp_path, rng, capsys, monkeypatch):
     def press(self, x, slopes):
         raise KeyboardInterrupt
@@ -478,6 +487,14 @@ def test_the_initial_rendering_is_exported_and_nothing_else(tmp_path, rng, capsy
     expected = np.rint(tonemap(pixels(tmp_path / "a.exr").astype(np.float64), "reinhard") * 65535)
     assert expected.max() < 65535 and pixels(tmp_path / "a.exr").max() > 1
     assert np.abs(read_png(tmp_path / "b.png") - expected).max() <= 1
+
+
+def test_strokes_that_paint_nothing_are_a_mistake_of_the_configuration(tmp_path, rng, capsys):
+    strokes = [{"type": "light", "ellipse": [9, 9, 1, 1]}, {"type": "blur", "radius": 0.1, "opacity": 0}]
+    assert call(world(tmp_path, rng, target={"kind": "strokes", "strokes": strokes}), "--dry-run") == 2
+    says = capsys.readouterr().err.splitlines()[-1]
+    assert says.startswith("envedit: target.strokes[0] (light): lies outside the ")
+    assert says.endswith("; target.strokes[1] (blur): opacity 0, nothing was painted")
 
 
 def test_a_map_that_its_turn_leaves_as_it_is_is_not_called_no_target(tmp_path, rng, capsys):

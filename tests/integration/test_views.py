@@ -105,6 +105,12 @@ def test_views_that_cannot_be_are_refused(tmp_path, two):
         pipeline.run(settings_of(two, target={"kind": "strokes", "strokes": [stroke]}))
 
 
+@pytest.mark.parametrize("given", ["[]", "['a', 'a']", "'front'", "[-1]", "[true]", "0"])
+def test_lists_of_sensors_that_say_nothing(given):
+    with pytest.raises(ConfigError, match=r'scene.sensors: got .*, expected "all", or a list'):
+        config.loads(f"[scene]\nsensors = {given}")
+
+
 # ---- targets -----------------------------------------------------------------------------------------------
 
 
@@ -161,6 +167,7 @@ def test_what_is_painted_belongs_to_a_view_and_the_others_hold(two):
     ('kind = "image"\nfile = ["a.exr", "b.exr"]\nview = [1, 1]', "target.view: got a view twice"),
     ('kind = "image"\nfile = ["a.exr", "b.exr"]\nmask = "c.png"', "target.mask: got 1 masks, expected 2"),
     ('kind = "strokes"\nstrokes = [{ type = "blur", radius = 1 }]\nview = 1', "target.view: got one"),
+    ("view = -1", "the index of a view from 0, or a list of them"),
 ])  # fmt: skip
 def test_targets_that_fit_no_views(keys, what):
     with pytest.raises(ConfigError, match=what):

@@ -39,8 +39,6 @@ def test_metrics_are_finite_or_null(tmp_path):
         "file": Path("a") / "ö.exr",
     }
     manifest.write_json(tmp_path / "metrics.json", metrics)
-    with pytest.raises(TypeError, match=r"b\[1\].c: object cannot be written"):
-        manifest.write_json(tmp_path / "metrics.json", {"b": [0, {"c": object()}]})
     lost: list[str] = []
     manifest.plain(metrics, "", lost)
     assert lost == ["render.ssim", "trace[1]"]
@@ -53,6 +51,15 @@ def test_metrics_are_finite_or_null(tmp_path):
     assert read["iterations"] == 7 and read["cached"] is True and read["active_rows"] == [0, 63]
     assert read["trace"] == [1.0, None] and read["file"] == str(Path("a") / "ö.exr")
     assert list(read) == list(metrics)
+
+
+def test_failed_write_leaves_the_old_file_and_nothing_else(tmp_path):
+    path = tmp_path / "metrics.json"
+    manifest.write_json(path, {"a": 1})
+    with pytest.raises(TypeError, match=r"b\[1\].c: object cannot be written"):
+        manifest.write_json(path, {"b": [0, {"c": object()}]})
+    assert json.loads(path.read_text()) == {"a": 1}
+    assert [p.name for p in tmp_path.iterdir()] == ["metrics.json"]
 
 
 def test_manifest_names_what_explains_a_run(tmp_path):

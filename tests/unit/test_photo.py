@@ -104,3 +104,10 @@ def test_photographs_that_tell_nothing_are_refused(lit, tmp_path, values, keys, 
     images.write_png(tmp_path / "photo.png", values)
     with pytest.raises(error, match=says):
         made(lit, keys.pop("file", tmp_path / "photo.png"), **keys)
+
+
+def test_the_configuration_names_what_is_missing():
+    with pytest.raises(ConfigError, match="expected the photograph"):
+        config.Target(kind="photo")
+    with pytest.raises(ConfigError, match=r"target\.curve"):
+        config.Target(kind="photo", file="a.png", curve="velvia")

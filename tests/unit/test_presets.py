@@ -34,6 +34,30 @@ def test_default_then_preset_then_file_then_override_key_by_key():
     assert config.scene.parameters == {"a": "glossy", "b": True}
 
 
+MANY = ("siren", "pixels", "log-pixels")
+
+
+@pytest.mark.parametrize(("preset", "kind", "ssim", "iterations", "dists"), [
+    ("standard", "layers", 0.1, 100, 0.0),
+    ("draft", "layers", 0.1, 100, 0.0),
+    ("standard", "siren", 1.0, "auto", "auto"),
+    ("draft", "siren", 1.0, 150, "auto"),
+    *(("standard", kind, 1.0, 600, 0.0) for kind in MANY[1:]),
+    *(("draft", kind, 1.0, 150, 0.0) for kind in MANY[1:]),
+    *(("paper", kind, (1.0, 1e4), 400, 0.6) for kind in ("layers", *MANY)),
+])  # fmt: skip
+def test_losses_and_length_suit_the_kind(preset, kind, ssim, iterations, dists):
+    given = [
+        cfg.loads(f'preset = "{preset}"\n[representation]\nkind = "{kind}"'),
+        cfg.loads("", preset=preset, overrides=[f"representation.kind={kind}"]),
+        cfg.from_dict({"representation": {"kind": kind}}, overrides=[f"preset={preset}"]),
+    ]
+    for config in given:
+        assert config.representation.kind == kind
+        assert (config.loss.ssim, config.optimizer.iterations) == (ssim, iterations)
+        assert config.loss.dists == dists
+
+
 def test_the_last_kind_counts_and_file_and_override_beat_its_defaults_key_by_key():
     text = '[representation]\nkind = "siren"'
     assert cfg.loads(text, overrides=["representation.kind=layers"]).optimizer.iterations == 100
@@ -42,7 +66,6 @@ def test_the_last_kind_counts_and_file_and_override_beat_its_defaults_key_by_key
     text = 'preset = "draft"\n[representation]\nkind = "pixels"\n[optimizer]\niterations = 7'
     config = cfg.loads(text)
     assert (config.optimizer.iterations, config.loss.ssim) == (7, 1.0)
-    assert cfg.loads("", overrides=["representation.kind=siren"]).loss.dists == "auto" != config.loss.dists
     config = cfg.loads(text, overrides=["optimizer.iterations=8", "loss.ssim=[1, 2]"])
     assert (config.optimizer.iterations, config.loss.ssim) == (8, (1, 2))
     # What neither the kind nor the file names is the preset's.
@@ -123,8 +146,7 @@ OUT = {"dir": "/out"}
 
 
 @pytest.mark.parametrize(
-    ("preset", "kind", "target"),
-    [*itertools.product(PRESETS, ("layers", "siren", "pixels", "log-pixels", ""), TARGETS)],
+    ("preset", "kind", "target"), [*itertools.product(PRESETS, ("layers", *MANY, ""), TARGETS)]
 )
 def test_tables_from_python_and_from_toml_are_equal(preset, kind, target):
     """A preset names the kind where none is given."""

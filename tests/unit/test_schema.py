@@ -75,9 +75,12 @@ def test_an_override_without_key_or_value_is_refused(text):
     ('[representation]\nkind = "layer"', ["representation.kind: got 'layer'", "did you mean layers?"]),
     ("[representation]\ncycles = 0", ["representation.cycles: got 0", "from 1 to 256"]),
     ('[fit]\nschedule = "cosin"', ["fit.schedule: got 'cosin'", "did you mean cosine?"]),
+    ("[target]\nfile = 'b.exr'\nrotate_degrees = 5", ["a.toml", "target.file and target.rotate_degrees"]),
     ("[target]\nkind = 'image'", ["target.file", "expected the painted image"]),
-    ("[target]\nkind = 'photo'", ["target.file", "expected the photograph"]),
-    ("[target]\nkind = 'photo'\nfile = 'a.png'\ncurve = 'velvia'", ["target.curve: got 'velvia'"]),
+    (
+        "[target]\nkind = 'rendering'\nfile = ['a.png', 'b.png']\nmask = 'm.png'",
+        ["target.mask: got 1 masks, expected 2"],
+    ),
     ("[target]\nrest = 'stay'", ["target.rest: got 'stay'", "follow"]),
     *(
         (f"[perceptual]\n{key} = 'a.npz'", ["expected both or none"])

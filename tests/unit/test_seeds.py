@@ -12,8 +12,9 @@ def test_no_two_purposes_share_samples_and_the_largest_seed_stays_one():
     own = [*found.values(), seeds.pilot(0), seeds.columns(0), *(seeds.recording(0, i) for i in range(1, 10))]
     assert len(set(own)) == len(own)
     most = seeds.Seeds(2**32 - 1)
-    cut = most.second_recording, most.step_check, most.turn_check, most.solution_check, most.pass_of_page(3)
-    assert max(cut) < 2**32
+    checks = most.step_check, most.turn_check, most.solution_check
+    assert (most.second_recording, *checks) == (500_008, 700_000, 800_010, 900_000)
+    assert most.pass_of_page(3) == 9_000_023
 
 
 def test_no_other_module_adds_to_a_seed():

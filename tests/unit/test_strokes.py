@@ -357,6 +357,13 @@ def test_strokes_come_back_from_toml_equal_and_paint_the_same(rng):
     np.testing.assert_array_equal(one, other)
 
 
+def test_what_is_held_still_counts_as_painted_and_keeps_its_bits(rng):
+    picture = rng.random((16, 16, 3)).astype(np.float32)
+    done = strokes.paint(picture, [{"type": "hold", "rectangle": [0.25, 0.25, 0.75, 0.5]}])
+    np.testing.assert_array_equal(done.picture, picture)
+    assert done.coverage[4:8, 4:12].min() == 1 and done.coverage.sum() == 32
+
+
 # ---- the edits that come ready -----------------------------------------------------------------------------
 @pytest.mark.parametrize("name", sorted(file.stem for file in EDITS.iterdir()))
 def test_the_edits_that_come_ready_paint_something(name, rng):

@@ -19,7 +19,7 @@ import numpy as np
 from envedit.config.toml import parsed, quote
 from envedit.config.validators import Check, Number, Numbers, named
 from envedit.core import atomic_files, latlong
-from envedit.core.color import LUMINANCE
+from envedit.core.color import LUMINANCE, luminance
 from envedit.core.errors import ConfigError, InputError
 from envedit.core.types import FilePath
 from envedit.export import light_list
@@ -105,7 +105,7 @@ def layers_of(envmap: np.ndarray, aureole: np.ndarray | None = None) -> Layers:
 
 def sky_irradiance(layers: Layers, sky: np.ndarray) -> float:
     """Return the luminance of the irradiance of level ground by a sky (rows, W, 3) without lights."""
-    return ground_irradiance(sky[: layers.shape[0]], layers.rows)
+    return float(luminance(ground_irradiance(sky[: layers.shape[0]], layers.rows)))
 
 
 def smallest(width: int) -> float:

@@ -25,7 +25,8 @@ def measure_glow(settings, folder, file: str) -> dict:
     strongest = max(
         (k for k, glow in enumerate(glows) if glow is not None), key=lambda k: luminance(made.lights.flux[k])
     )
-    flux = luminance(made.lights.flux[strongest]) / aureoles.ground_irradiance(made.base, made.rows)
+    sky = luminance(aureoles.ground_irradiance(made.base, made.rows))
+    flux = luminance(made.lights.flux[strongest]) / sky
     return {"flux": float(flux), "glow": luminance(glows[strongest])[list(DEGREES)].tolist()}
 
 

@@ -11,7 +11,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from envedit.core import latlong
-from envedit.core.color import LUMINANCE
+from envedit.core.color import LUMINANCE, luminance
 from envedit.core.rotations import rotation_vector
 from envedit.images import images
 from envedit.representations.layers import aureoles, layers, lights
@@ -329,19 +329,34 @@ def test_without_a_glow_in_the_map_spare_lights_have_that_of_a_clear_sun(rng):
     at = np.radians([10.0, 60.0, 130.0])
     d = mi.Vector3f(np.stack([np.sin(at), np.cos(at), 0 * at]).astype(np.float32))
     # The mean of the sky is not its irradiance over pi to the last digit.
-    strength = 2 * 0.25 / 1.25 * min(1.0, aureoles.ground_irradiance(sky, (0, H)) / 3)
-    expected = 1 + 26 * np.exp(-np.array([10, 60, np.inf]) / 15)[:, None] * np.full(3, strength)
+    strength = 2 * 0.25 / 1.25 * np.minimum(1.0, aureoles.ground_irradiance(sky, (0, H)) / 3)
+    expected = 1 + 26 * np.exp(-np.array([10, 60, np.inf]) / 15)[:, None] * strength
     np.testing.assert_allclose(made.glow_of(1, single(turn), single(flux), d).numpy().T, expected, rtol=1e-4)
     for radiance in (0.0, 1e-300):
         made = Lights(own, (0, H), W, background=np.full((H, W, 3), radiance))
         assert made.glows[1] is None and np.isfinite(made.flux).all()
 
 
+def test_a_glow_has_no_other_colour_where_the_sky_has(rng):
+    """Elsewhere the sky is twice as red and half as blue: its glow is no redder there, nor bluer."""
+    light = patch(rng, 4, 10)
+    glow = np.exp(-GLOW_DEGREES / 10)[:, None] * np.float64([3.0, 2.0, 1.0])
+    light = dataclasses.replace(light, glow=glow)
+    toward = latlong.directions(H, W)
+    opposite = (toward @ light.direction < 0)[..., None]
+    sky = np.where(opposite, [2.0, 1.0, 0.5], [1.0, 1.0, 1.0])
+    made = Lights([light], (0, H), W, background=sky)
+    away = -light.direction
+    d, centre = (mi.Vector3f(*v.tolist()) for v in (away, away))
+    got = made.glow_around(0, d, centre).numpy().ravel()
+    np.testing.assert_allclose(got, np.array([3.0, 2.0, 1.0]) * [0.5, 1.0, 1.0], rtol=0.02)
+
+
 @pytest.mark.parametrize("name", ["autumn_field", "rustig_koppie", "syferfontein_18d_clear"])
 def test_the_glow_of_a_clear_sun_is_that_of_photographed_ones(name, data):
     image, _ = images.load_envmap(str(data / "puresky" / f"{name}_puresky_1k.hdr"), 256)
     made = layers.Layers.of(image[:64], (0, 128))
-    flux = made.lights.flux[0] / aureoles.ground_irradiance(made.base, (0, 128))
+    flux = made.lights.flux[0] / luminance(aureoles.ground_irradiance(made.base, (0, 128)))
     strength = aureoles.glow_strength(flux / aureoles.CLEAR_FLUX)
     expected = (aureoles.clear_glow() * strength)[5:31] @ LUMINANCE
     ratio = made.lights.glows[0][5:31] @ LUMINANCE / expected

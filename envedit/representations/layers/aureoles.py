@@ -2,8 +2,9 @@
 
 A glow G is measured as a factor of the sky around a light (``separation.py``). Of a light at direction d,
 with s times its flux, it is f(s) c(d) G, with f(s) = 2 s / (1 + s) and c(d) = min(1, M(d_0) / M(d)): d_0 is
-where the light was, M(d) the mean luminance of the background under G around d. A glow is light of the sun
-that air has scattered. Before bright clouds or at a bright horizon it is therefore no brighter in itself, c.
+where the light was, M(d) the mean radiance of the background under G around d, per channel. A glow is light
+of the sun that air has scattered. Before bright clouds or at a bright horizon it is therefore no brighter in
+itself, c, nor of another colour.
 It is gone with its light, but of a brighter sun it is hardly brighter: on eight PureSky maps, whose suns have
 0.06 to 25 times the irradiance of their skies, the glow at 10 degrees goes with the flux to the power of 0.12
 (``python -m experiments natural.aureoles run``).
@@ -21,7 +22,6 @@ import numpy as np
 
 from envedit.core import latlong
 from envedit.core.arrays import tensor
-from envedit.core.color import LUMINANCE
 from envedit.representations.layers.separation import GLOW_DEGREES, coarse
 
 CLEAR_FLUX, CLEAR_GLOW, CLEAR_GLOW_DEGREES = 40.0, 26.0, 15.0
@@ -50,41 +50,45 @@ def clear_glow() -> np.ndarray:
     return table
 
 
-def ground_irradiance(sky: np.ndarray, rows: tuple[int, int]) -> float:
-    """Return the luminance of the irradiance of level ground by a sky (n, W, 3) without lights.
+def ground_irradiance(sky: np.ndarray, rows: tuple[int, int]) -> np.ndarray:
+    """Return the irradiance (3,) of level ground by a sky (n, W, 3) without lights.
 
     ``rows`` are its first row in the map, and the rows of the map; those below the horizon light nothing.
     """
     first, total = rows
     weight = latlong.level_weights(total, sky.shape[1])[first : first + len(sky)]
-    return float(weight @ (sky.astype(np.float64) @ LUMINANCE).sum(axis=1))
+    return weight @ sky.sum(axis=1, dtype=np.float64)
 
 
 @dataclass(frozen=True)
 class Sky:
-    """A background in means over some degrees: ``luminance`` (n,) and ``omega`` (n,) at ``directions``."""
+    """A background in means over some degrees."""
 
-    directions: np.ndarray  # (n, 3)
-    luminance: np.ndarray
+    # directions, radiance: (n, 3); omega: (n,), solid angle
+    directions: np.ndarray
+    radiance: np.ndarray
     omega: np.ndarray
-    irradiance: float  # of the ground, luminance
+    irradiance: np.ndarray  # of the ground, (3,)
 
     @classmethod
     def of(cls, background: np.ndarray, rows: tuple[int, int]) -> Sky:
         """Average a background (rows, W, 3); ``rows`` are its first row, and the rows of the map."""
-        shape, known, luminance, omega = coarse(background @ LUMINANCE, *rows)
+        shape, known, radiance, omega = coarse(background, *rows)
         return cls(
             directions=latlong.directions(*shape).reshape(-1, 3)[known],
-            luminance=luminance,
+            radiance=radiance,
             omega=omega,
             irradiance=ground_irradiance(background, rows),
         )
 
     def mean(self, glow: np.ndarray, toward: np.ndarray) -> np.ndarray:
-        """Return M (k,), the mean luminance under a glow (len(GLOW_DEGREES), 3) around directions (k, 3)."""
+        """Return M (k, 3), the mean radiance under a glow (len(GLOW_DEGREES), 3) around directions (k, 3)."""
         angle = np.degrees(np.arccos(np.clip(toward @ self.directions.T, -1, 1)))
-        weight = np.interp(angle, GLOW_DEGREES, glow @ LUMINANCE) * self.omega
-        return weight @ self.luminance / np.maximum(weight.sum(axis=1), 1e-30)
+        means = []
+        for of_channel, radiance in zip(glow.T, self.radiance.T, strict=True):
+            weight = np.interp(angle, GLOW_DEGREES, of_channel) * self.omega
+            means.append(weight @ radiance / np.maximum(weight.sum(axis=1), 1e-30))
+        return np.stack(means, axis=1)
 
 
 class Aureole:
@@ -97,19 +101,19 @@ class Aureole:
     def __init__(self, glow: np.ndarray, home: np.ndarray | None, sky: Sky | None):
         self._table = dr.opaque(mi.Float(glow.astype(np.float32).ravel()))
         self._log_level: mi.Texture3f | None = None
-        if sky is None or not sky.luminance.any():
+        if sky is None or not sky.radiance.any():
             return
-        at_home = sky.irradiance / math.pi if home is None else float(sky.mean(glow, home[None])[0])
-        if not at_home > 0:
+        at_home = sky.irradiance / math.pi if home is None else sky.mean(glow, home[None])[0]
+        if not (at_home > 0).any():
             return
         side = np.linspace(-1, 1, NODES)
         nodes = np.stack(np.meshgrid(side, side, side, indexing="ij"), axis=-1)[..., ::-1].reshape(-1, 3)
         nodes = nodes / np.maximum(np.linalg.norm(nodes, axis=1, keepdims=True), 1e-30)
-        log_level = np.log(np.maximum(sky.mean(glow, nodes) / at_home, 1))
-        table = tensor(log_level.astype(np.float32).reshape(NODES, NODES, NODES, 1))
+        log_level = np.log(np.maximum(sky.mean(glow, nodes) / np.maximum(at_home, 1e-30), 1))
+        table = tensor(log_level.astype(np.float32).reshape(NODES, NODES, NODES, 3))
         self._log_level = mi.Texture3f(table, use_accel=False)
         # At home c is 1, whatever is interpolated there between nodes.
-        self._log_at_home = dr.opaque(mi.Float, 0.0)
+        self._log_at_home = dr.opaque(mi.Color3f, 0.0)
         if home is not None:
             self._log_at_home = dr.opaque(self._interpolated(mi.Vector3f(*home.tolist())))
 
@@ -121,9 +125,9 @@ class Aureole:
         return _interpolated_glow(self._table, dr.dot(d, centre)) * strength
 
     def _interpolated(self, toward):
-        """Return log M at a direction, linearly between nodes."""
+        """Return log M at a direction, per channel, linearly between nodes."""
         place = mi.Point3f(toward) * (0.5 * (NODES - 1) / NODES) + 0.5
-        return self._log_level.eval(place)[0]
+        return mi.Color3f(*self._log_level.eval(place))
 
 
 def _interpolated_glow(table, cosine):

@@ -111,11 +111,12 @@ class Lights:
         # ---- Those of spare ones
         sky = None if background is None else Sky.of(background, rows)
         strongest = _strongest([light.glow for light in lights], own)
-        clear = sky is not None and strongest is None and sky.irradiance > LEAST_IRRADIANCE
+        sky_irradiance = 0.0 if sky is None else sky.irradiance @ LUMINANCE
+        clear = strongest is None and sky_irradiance > LEAST_IRRADIANCE
         spare = own.mean(axis=0) if len(own) else np.ones(3)
         spare = np.maximum(spare, FAINTEST * spare.max())
         if clear:
-            spare *= CLEAR_FLUX * sky.irradiance / (spare @ LUMINANCE)
+            spare *= CLEAR_FLUX * sky_irradiance / (spare @ LUMINANCE)
         d, weight, spacing = lobe()
         directions += [d] * SPARE
         fluxes += [weight[:, None] * spare] * SPARE
@@ -238,6 +239,10 @@ class Lights:
         centre = rotate(turned_by, dr.gather(mi.Vector3f, self._centre, index))
         factor = _exp(dr.gather(mi.Color3f, log_flux.array, index))
         return 1 + aureole.at(d, centre, factor)
+
+    def glow_around(self, i: int, d: mi.Vector3f, centre: mi.Vector3f) -> mi.Color3f:
+        """Evaluate c G of light ``i`` of its own flux, which has a glow, at ``d`` if it is at ``centre``."""
+        return self._aureoles[i].at(d, centre, mi.Color3f(1))
 
 
 def placed(

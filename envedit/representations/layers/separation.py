@@ -305,25 +305,27 @@ def _cut_off(part, lum, omega):
 
 
 def coarse(
-    lum: np.ndarray, first: int, total: int
+    image: np.ndarray, first: int, total: int
 ) -> tuple[tuple[int, int], np.ndarray, np.ndarray, np.ndarray]:
-    """Average luminance (rows, W) over some degrees, of rows from ``first`` of a map of ``total`` rows.
+    """Average an image (rows, W, n) over some degrees, of rows from ``first`` of a map of ``total`` rows.
 
-    Returns rows and columns of the coarse map, which of its texels are known, (h * w,) bool, and of those the
-    luminance and the known part of the solid angle.
+    Returns rows and columns of the coarse map, which of its texels are known, (h * w,) bool, and of those
+    the mean, (known, n), and the known part of the solid angle.
     """
-    w = min(COARSE_COLUMNS, lum.shape[1])
+    w = min(COARSE_COLUMNS, image.shape[1])
     h = max(w // 2, 3)
-    sums, share = (small.ravel() for small in _resized(lum[..., None], first, total, (h, w)))
-    known = share > 1e-6
-    weight = np.repeat(latlong.solid_angles(h, w), w)[known] * share[known]
-    return (h, w), known, sums[known] / share[known], weight
+    sums, share = _resized(image, first, total, (h, w))
+    known = share.ravel() > 1e-6
+    sums, share = sums.reshape(h * w, -1)[known], share.ravel()[known]
+    weight = np.repeat(latlong.solid_angles(h, w), w)[known] * share
+    return (h, w), known, sums / share[:, None], weight
 
 
 def _local_median(lum, first, total):
     """Median luminance, by solid angle, of the disc around every texel, found on a coarse grid."""
     height, width = lum.shape
-    (h, w), known, value, weight = coarse(lum, first, total)
+    (h, w), known, value, weight = coarse(lum[..., None], first, total)
+    value = value[:, 0]
     d = latlong.directions(h, w).reshape(-1, 3)
     order = np.argsort(value, kind="stable")
     value, weight, others = value[order], weight[order], d[known][order]

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import functools
+import math
+from collections.abc import Callable
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from envedit.core import latlong
-from envedit.core.arrays import flat, tensor
+from envedit.core.arrays import flat, tensor, vectors
 from envedit.core.color import LUMINANCE
 from envedit.representations.layers.layers import Layers
 from envedit.transport.light_transport import LightTransport
@@ -55,6 +57,12 @@ class BlockJacobian:
         self._hats = np.concatenate(hats, axis=1)[used].astype(np.float32)
         self._matrix = [np.ascontiguousarray(m[:, used]) for m in overview.matrix]
         self._tensors = [tensor(m) for m in self._matrix]
+        # Where in the sky is what the texels of a cell follow.
+        toward = latlong.directions(*shape)[layers.active]
+        if layers.below is not None:
+            toward[layers.shape[0] :] = toward[layers.below.mirrored]
+        toward = np.stack([self._means(one.ravel()) for one in np.moveaxis(toward, 2, 0)], axis=1)
+        self._toward = toward / np.maximum(np.linalg.norm(toward, axis=1, keepdims=True), 1e-30)
         # Cells that are more than half full of texels above the horizon that may change.
         texels = slice(layers.shape[0] * shape[1])
         changeable = (self._omega.reshape(*self._shape, 1) * layers.changeable).ravel()
@@ -110,6 +118,25 @@ class BlockJacobian:
         size = np.maximum(np.bincount(self.block_of, minlength=self.count), 1)[:, None]
         by_blocks = [tensor(np.outer(of_channel, upward)) for of_channel in (self.summed(ground) / size).T]
         return CellLights([lit + lit_ground for lit, lit_ground in zip(self._lit, by_blocks, strict=True)])
+
+    def glows(self, slope: np.ndarray, glow: Callable[[mi.Vector3f, mi.Vector3f], mi.Color3f]) -> list:
+        """Return pictures of a glow around each cell of :attr:`sky`, tensors (blocks, n), per channel.
+
+        ``glow`` returns what it adds to the factor of the sky at directions (m,), around centres (m,);
+        ``slope`` (rows, W, 3) is the derivative of the map by that factor.
+        """
+        _, centres = self.sky
+        shape = len(self._toward), len(centres)
+        cell, centre = np.divmod(np.arange(math.prod(shape), dtype=np.uint32), np.uint32(max(shape[1], 1)))
+        around = glow(
+            dr.gather(mi.Vector3f, vectors(mi.Vector3f, self._toward), mi.UInt32(cell)),
+            dr.gather(mi.Vector3f, vectors(mi.Vector3f, centres), mi.UInt32(centre)),
+        )
+        pictures = []
+        for c, matrix in enumerate(self._matrix):
+            factor = around[c].numpy().reshape(shape)
+            pictures.append(tensor((matrix * self._means(slope[..., c].ravel())) @ factor))
+        return pictures
 
     def spread(self, covariance: np.ndarray) -> np.ndarray:
         """Return the standard deviation of the sum of all grids in every texel, (rows, W)."""

@@ -6,6 +6,7 @@ at the largest noise that paint has.
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import drjit as dr
@@ -16,6 +17,7 @@ from envedit.core import latlong
 from envedit.core.arrays import flat, tensor
 from envedit.core.rotations import rotation_vector
 from envedit.losses import display_curve
+from envedit.representations.layers.aureoles import glow_strength
 from envedit.solve.light_places import (
     PLACES_APART_COSINE,
     PROBE_SPACINGS,
@@ -27,12 +29,14 @@ from envedit.solve.light_places import (
 )
 from envedit.solve.likelihood import Likelihood, of_mean
 from envedit.solve.map_problem import Problem
+from envedit.solve.unknowns import with_light
 from envedit.transport.light_transport import LightTransport
 
 OWN_FLUX_FACTORS = 2.0 ** np.arange(-2, 1.5, 0.5)
 """Fluxes that a light of the map is tried with elsewhere, over its own."""
-ADDED_FLUX_SHARES = 2.0 ** np.arange(-6, 1.5, 0.5)
-"""Fluxes that an added light is tried with, as shares of the light in the picture."""
+ADDED_FLUX_SHARES, ADDED_FLUXES = (1 / 64, 2.0), 15
+"""Least and largest flux that an added light is tried with, and how many: by what it and its glow add to the
+light in the picture, and by what it adds alone."""
 LARGER_DEGREES = (2.0, 8.0)
 """Radii of larger lights that are tried: what is painted into something smooth is as large as its image."""
 POSITIVE_EVIDENCE = 2.0
@@ -59,22 +63,26 @@ def best(
     total = np.maximum(weight, 1e-30)
     compared = _Comparison(
         likelihood=likelihood,
+        own=trial.own,
         before=blocks.summed(likelihood.weight * point.rendering) / total,
         target=blocks.summed(likelihood.weight * problem.picture) / total,
         weight=weight[:, 0],
         share=blocks.summed(likelihood.share)[:, 0],
     )
-    factors, unlikeliness = compared.best(blocks.cells(trial.ground).of(lights.flux[k]), trial.own)
+    cores = blocks.cells(trial.ground).of(lights.flux[k])
+    _, unlikeliness = compared.best(cores, trial.glows_of_cells())
     if away is not None:
         unlikeliness = np.where(directions @ away > PLACES_APART_COSINE, np.inf, unlikeliness)
     places: list[Place] = []
     texels: list[np.ndarray] = []
     for at in most_promising(directions, -unlikeliness):
-        texel = trial.texel(directions[at])
+        glow = trial.glow(directions[at])
+        texel = trial.texel(directions[at], glow)
         if is_apart(texel.direction, texels):
             texels.append(texel.direction)
             larger = () if trial.own else LARGER_DEGREES
-            places.append(_smallest([texel, *(trial.lobe(directions[at], degrees) for degrees in larger)]))
+            lobes = [trial.lobe(directions[at], degrees, glow) for degrees in larger]
+            places.append(_smallest([texel, *lobes]))
     return places
 
 
@@ -85,36 +93,66 @@ def _smallest(sizes):
 
 
 class _TriedLight:
-    """A light in place of none, in the picture of a point."""
+    """A light in place of none, in the picture of a point: its core, and its glow in the sky around it."""
 
     def __init__(self, problem, point, k):
-        self.problem, self.transport, self.k = problem, point.transport, k
-        self.own, self.flux = k < problem.layers.lights.own, problem.layers.lights.flux[k]
+        layers = problem.layers
+        self.problem, self.point, self.transport, self.k = problem, point, point.transport, k
+        self.own, self.flux = k < layers.lights.own, layers.lights.flux[k]
         self.ground = lit_ground(problem, point)
+        self._slope = None
+        if layers.lights.glows[k] is not None:
+            self._slope = layers.glow_slope(problem.params(point.state), point.sky)
         self._compared = _Comparison(
             likelihood=problem.likelihood,
+            own=self.own,
             before=point.rendering.reshape(-1, 3),
             target=problem.picture.reshape(-1, 3),
             weight=problem.likelihood.weight.ravel(),
             share=problem.likelihood.share.ravel(),
         )
 
-    def texel(self, direction):
-        """Return the best texel around a direction, through exact columns."""
+    def glows_of_cells(self):
+        """Return pictures of the glow around each cell of the sky, (blocks, n) per channel; None of none."""
+        if self._slope is None:
+            return None
+        lights = self.problem.layers.lights
+        return self.problem.blocks.glows(self._slope, functools.partial(lights.glow_around, self.k))
+
+    def glow(self, direction):
+        """Return the picture (pixels, 3) of the glow around a direction, of the flux; None of none."""
+        if self._slope is None:
+            return None
+        problem, layers = self.problem, self.problem.layers
+        turn = rotation_vector(layers.lights.centres[self.k], direction)
+        placed = with_light(self.point.state, self.k, turn=turn, flux=0.0)
+        sky, cores = (part.numpy() for part in layers.parts(problem.params(placed)))
+        change = np.zeros_like(problem.envmap)
+        change[problem.rows] = sky - self.point.sky
+        picture = self.transport.linear(tensor(change)).numpy()
+        if self.ground is not None:  # ground that the core shines on is in the core's picture
+            core = cores - (self.point.edited[problem.rows] - self.point.sky)
+            picture -= np.float32(layers.ground_light.irradiance(core[: layers.shape[0]]) * self.ground)
+        return picture.reshape(-1, 3)
+
+    def texel(self, direction, glow):
+        """Return the best texel around a direction, through exact columns; ``glow`` is that there."""
         height, width = self.problem.envmap.shape[:2]
         row, column = (round(float(x)) for x in latlong.texel_position(direction, height, width))
         for spacing in PROBE_SPACINGS:
             texels, pictures = probed(
                 self.problem, self.transport, row, column, self.flux, spacing, reach=1, ground=self.ground
             )
-            factors, unlikeliness = self._best(pictures)
+            factors, unlikeliness = self._best(pictures, glow)
             at = int(np.argmin(unlikeliness))
             row, column = divmod(int(texels[at]), width)
-        direction = latlong.directions(height, width)[row, column]
-        return Place(direction, np.full(3, np.log(factors[at])), -float(unlikeliness[at]))
+            direction = latlong.directions(height, width)[row, column]
+            glow = self.glow(direction)
+        factors, unlikeliness = self._best(pictures[at : at + 1], glow)
+        return Place(direction, np.full(3, np.log(factors[0])), -float(unlikeliness[0]))
 
-    def lobe(self, direction, degrees):
-        """Return the place of a lobe of some radius."""
+    def lobe(self, direction, degrees, glow):
+        """Return the place of a lobe of some radius, with a :meth:`glow` there."""
         layers = self.problem.layers
         turn = rotation_vector(layers.lights.centres[self.k], direction)
         placement = turn, np.zeros(3), layers.lights.log_size(degrees)
@@ -123,12 +161,15 @@ class _TriedLight:
         if self.ground is not None:
             light = layers.ground_light.irradiance(core[0, : layers.shape[0]])
             picture += np.float32(light * self.ground)
-        factors, unlikeliness = self._best(picture.reshape(1, -1, 3))
+        factors, unlikeliness = self._best(picture.reshape(1, -1, 3), glow)
         return Place(direction, np.full(3, np.log(factors[0])), -float(unlikeliness[0]), degrees)
 
-    def _best(self, pictures):
-        """Return the best factors of the flux of pictures (k, pixels, 3), and -2 log likelihood then."""
-        return self._compared.best([tensor(one) for one in pictures.T], self.own)
+    def _best(self, pictures, glow):
+        """Return the best factors of the flux of cores (k, pixels, 3), and -2 log likelihood then."""
+        glows = None
+        if glow is not None:
+            glows = [tensor(np.repeat(one[:, None], len(pictures), axis=1)) for one in glow.T]
+        return self._compared.best([tensor(one) for one in pictures.T], glows)
 
 
 @dataclass(frozen=True)
@@ -136,40 +177,51 @@ class _Comparison:
     """Pixels or blocks of them, by which pictures of a light are compared.
 
     ``before`` and ``target`` are linear radiance (n, 3); ``weight`` (n,) and ``share`` (n,) those of the
-    likelihood.
+    likelihood. ``own``: the light is one of the map.
     """
 
     likelihood: Likelihood
+    own: bool
     before: np.ndarray
     target: np.ndarray
     weight: np.ndarray
     share: np.ndarray
 
-    def best(self, pictures: list[mi.TensorXf], own: bool) -> tuple[np.ndarray, np.ndarray]:
-        """Return the likeliest factor of the flux of k pictures, and -2 log likelihood then, (k,) both.
+    def best(
+        self, cores: list[mi.TensorXf], glows: list[mi.TensorXf] | None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the likeliest factor of the flux of k lights, and -2 log likelihood then, (k,) both.
 
-        ``pictures`` are (n, k), per channel.
+        ``cores`` are their pictures (n, k), per channel, and ``glows`` those of their glows; None: of none.
         """
-        strengths = np.ones(pictures[0].shape[1])
-        if not own:  # of any flux; on black, as much as was painted
+        factors = np.repeat(OWN_FLUX_FACTORS[:, None], cores[0].shape[1], axis=1)
+        if not self.own:  # of any flux; on black, as much as was painted
             light = self.before.mean() or max(float(self.target.mean()), 1e-30)
-            mean = np.mean([dr.mean(one, axis=0).numpy() for one in pictures], axis=0)
-            strengths = light / np.maximum(mean, 1e-30)
-        factors = np.float32(np.outer(OWN_FLUX_FACTORS if own else ADDED_FLUX_SHARES, strengths))
-        squares, means = self._sums(pictures, factors)
+            of_core = np.mean([dr.mean(one, axis=0).numpy() for one in cores], axis=0)
+            of_light = of_core
+            if glows is not None:
+                of_light = of_core + np.mean([dr.mean(one, axis=0).numpy() for one in glows], axis=0)
+            least, most = ADDED_FLUX_SHARES
+            factors = np.geomspace(
+                least * light / np.maximum(of_light, 1e-30),
+                most * light / np.maximum(of_core, 1e-30),
+                ADDED_FLUXES,
+            )
+        squares, means = self._sums(cores, glows, np.float32(factors))
         area, noise = self.likelihood.area, self.likelihood.largest_noise
         unlikeliness = squares / (area * noise**2) + of_mean(means)
         least = unlikeliness.argmin(axis=0)[None]
         factor = np.take_along_axis(factors, least, axis=0)[0]
-        return factor.astype(np.float64), unlikeliness.min(axis=0)
+        return factor, unlikeliness.min(axis=0)
 
-    def _sums(self, pictures, factors):
-        """Return what is left of display values beside pictures times factors (f, k), summed over n.
+    def _sums(self, cores, glows, factors):
+        """Return what is left of display values beside lights of some factors (f, k), summed over n.
 
         Squares times :attr:`weight`, (f, k), and values times :attr:`share`, (f, k, 3).
         """
-        count, k = pictures[0].shape
+        count, k = cores[0].shape
         column, end, width = dr.arange(mi.UInt32, k), dr.opaque(mi.UInt32, count), dr.opaque(mi.UInt32, k)
+        strengths = [flat(mi.Float, glow_strength(row)) for row in factors]
         factors = [flat(mi.Float, row) for row in factors]
         before = flat(mi.Float, np.float32(self.before))
         goal = display_curve.to_display(tensor(self.target), self.likelihood.white).array
@@ -179,11 +231,14 @@ class _Comparison:
 
         def add(row, squares, means):
             w, part = dr.gather(mi.Float, weight, row), dr.gather(mi.Float, share, row)
-            for c, picture in enumerate(pictures):
+            for c, picture in enumerate(cores):
                 more = dr.gather(mi.Float, picture.array, row * width + column)
+                glow = mi.Float(0)
+                if glows is not None:
+                    glow = dr.gather(mi.Float, glows[c].array, row * width + column)
                 now, to = (dr.gather(mi.Float, one, 3 * row + c) for one in (before, goal))
-                for i, factor in enumerate(factors):
-                    off = display_curve.shown(now + more * factor, white) - to
+                for i, (factor, strength) in enumerate(zip(factors, strengths, strict=True)):
+                    off = display_curve.shown(now + more * factor + glow * strength, white) - to
                     squares[i] = squares[i] + mi.Float64(w * dr.square(off))
                     means[3 * i + c] = means[3 * i + c] + mi.Float64(part * off)
             return row + 1, squares, means

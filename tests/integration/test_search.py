@@ -5,14 +5,17 @@ import numpy as np
 import pytest
 
 from envedit.core import latlong
+from envedit.core.rotations import rotation_vector
 from envedit.losses.naturalness import white
 from envedit.representations.layers.layers import Layers
+from envedit.representations.layers.lights import DARK
 from envedit.scene import scene
-from envedit.solve import gauss_newton, search
+from envedit.solve import gauss_newton, painted_places, search
 from envedit.solve.gauss_newton import Run
 from envedit.solve.likelihood import VISIBLE, Likelihood, on_average_one
 from envedit.solve.map_problem import Problem
 from envedit.solve.prior import of_paint
+from envedit.solve.unknowns import with_light
 from envedit.targets.pixel_weights import FOLLOWING, pixel_weight
 from envedit.transport.light_transport import LightTransport
 from tests.oracles.maps import angle
@@ -132,6 +135,34 @@ def test_the_new_shadow_alone_says_so_too(transport):
     assert [*lights] == [0] and angle(lights[0], DIRECTIONS[place]) < 10
 
 
+@pytest.mark.parametrize("own", [True, False])
+def test_a_light_is_tried_with_its_glow(transport, own):
+    """What is promised of a place is what the composed map has there; not so of the core alone."""
+    image = sky()
+    image[:ROWS] *= 1 + 6 * np.exp(-angle(DIRECTIONS[:ROWS], DIRECTIONS[SUN]) / 15)[..., None]
+    image += sky(SUN, flux=0.5) - sky()
+    picture, coverage = painted(transport, image, image + sky((8, 44), flux=0.7) - sky(), share=0.2)
+    problem, state = problem_of(transport, image, picture, coverage)
+    lights, likelihood = problem.layers.lights, problem.likelihood
+    assert lights.own == 1 and lights.glows[0] is not None
+    k = 0 if own else 1
+    if own:
+        state = with_light(state, k, flux=DARK)
+    before = problem.evaluate(state)
+    away = lights.centres[0] if own else None
+    for there in painted_places.best(problem, state, problem.transport, k, away):
+        turn, size = rotation_vector(lights.centres[k], there.direction), 0.0
+        if not own:
+            size = lights.log_size(there.degrees)
+        placed = problem.evaluate(with_light(state, k, turn=turn, flux=there.log_flux, size=size))
+        composed = likelihood.misfit(placed.residual, likelihood.largest_noise)
+        assert -there.promise == pytest.approx(composed, rel=0.05)
+        core = problem.layers.cores_of(k, [(turn, there.log_flux, size)])
+        of_core = placed.transport.pictures(core, problem.rows).reshape(before.rendering.shape)
+        alone = problem.residual(state, before.rendering + of_core)
+        assert likelihood.misfit(alone, likelihood.largest_noise) != pytest.approx(composed, rel=0.1)
+
+
 # ---- a light is added --------------------------------------------------------------------------------------
 
 
@@ -187,16 +218,18 @@ def test_a_sun_that_is_painted_under_a_sky_without_one_is_added_although_it_ligh
     assert off.max() > VISIBLE
 
 
-def test_a_shadow_painted_softer_makes_the_sun_larger(transport):
-    """Also where a channel is black, without a division by zero."""
+@pytest.mark.parametrize("blue", [1, 0])
+def test_a_shadow_painted_softer_makes_the_sun_larger(transport, blue):
+    """Also where a channel is black, without a division by zero; there beside a light that is added."""
     image, softer = sky(SUN), sky()
     near = (DIRECTIONS @ DIRECTIONS[SUN] > np.cos(np.radians(25)))[..., None]
     sun = (image - softer)[SUN] * OMEGA[SUN[0]]
     softer += sun * near / (near[..., 0] * OMEGA[:, None]).sum()
-    image, softer = (one * np.float32([1, 1, 0]) for one in (image, softer))
+    image, softer = (one * np.float32([1, 1, blue]) for one in (image, softer))
     problem, start = problem_of(transport, image, *painted(transport, image, softer))
     found, *_ = found_for(problem, start)
-    assert "light 1 softened" in [found.name, *(one.name for one in found.others)]
+    softened = [one.name for one in (found, *found.others) if search.SOFTENED in one.name]
+    assert softened == ["light 1 softened" if blue else "light 1 softened, light added"]
 
 
 # ---- lights stay -------------------------------------------------------------------------------------------
@@ -212,8 +245,11 @@ def test_of_paint_that_no_light_makes_other_answers_are_shown(transport, rng):
     found, _, _, tried = found_for(problem, start)
     assert found.others and tried >= len(found.others)
     # What could not become likelier was given up; its steps can go on.
-    given_up = [one for one in found.others if len(one.run.history) < search.EXPLANATION_STEPS]
-    assert given_up
+    given_up = [one for one in found.others if not one.run.history]
+    assert len(given_up) >= 2
+    # "light 1 moved" is, but hardly likelier
+    assert found.name == "lights left where they are"
+    assert min(one.score for one in found.others) < found.score
     for one in given_up:
         further = search.completed(problem, one)
         assert further.score < one.score and len(further.run.history) > len(one.run.history)

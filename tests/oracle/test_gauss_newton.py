@@ -5,6 +5,7 @@ transport is then a texel and a block a pixel, and the Jacobian is exact.
 """
 
 import dataclasses
+import functools
 from copy import copy as shallow_copy
 
 import mitsuba as mi
@@ -22,6 +23,7 @@ from envedit.solve.gauss_newton import Run, solve
 from envedit.solve.likelihood import Likelihood, on_average_one
 from envedit.solve.map_problem import Problem
 from envedit.solve.prior import Prior, of_paint
+from envedit.solve.unknowns import with_light
 from envedit.solve.white_sky import WhiteSky
 from envedit.targets.photo import Camera, Photo
 from envedit.targets.pixel_weights import pixel_weight
@@ -874,6 +876,36 @@ def test_the_glow_is_in_the_derivative_by_a_lights_flux_and_place(added, rng):
         assert np.abs(linear.pictures[k] - slope).max() < 0.15 * np.abs(slope).max(), name
         first, last = ((weights * np.float64(end.edited[problem.rows])).sum() for end in ends)
         assert by_lights[k] == pytest.approx((first - last) / (2 * h), rel=0.02, abs=0.05), name
+
+
+@pytest.mark.parametrize("horizon", ["free", "mirror"])
+def test_a_light_in_a_new_place_has_its_glow_there(horizon, rng):
+    """Of the map's light and of one that is added, in pictures of cells: as the composed map has it there."""
+    d = latlong.directions(*GRID)
+    near = 4 * np.exp(-angle(d, d[SUN]) / 15)[..., None]
+    image = np.float32((0.4 + 0.05 * rng.random((*GRID, 3))) * (1 + near) + lamp(radiance=40.0))
+    transport = DenseTransport.random(rng, FILM, GRID, even=0.5)
+    layers = Layers.of(image, cycles=3, horizon=horizon)
+    lights = layers.lights
+    assert lights.own == 1 and all(glow is not None for glow in lights.glows)
+    problem = Problem(layers, transport, image, shown(transport, image))
+    start = problem.state(layers.start())
+    dark = start | {"flux": np.full_like(start["flux"], DARK)}
+    size = np.bincount(problem.blocks.block_of)[:, None]
+    _, cells = problem.blocks.sky
+    far = np.flatnonzero(cells @ lights.centres[0] < np.cos(np.radians(40)))
+    for k, without in ((0, dark), (1, start)):
+        before = problem.evaluate(without)
+        slope = layers.glow_slope(problem.params(without), before.sky)
+        of_cells = problem.blocks.glows(slope, functools.partial(lights.glow_around, k))
+        for at in rng.choice(far, 5):
+            turn = rotation_vector(lights.centres[k], cells[at])
+            change = problem.evaluate(with_light(without, k, turn=turn, flux=0.0)).sky - before.sky
+            expected = problem.blocks.summed(shown(transport, change)) / size
+            got = np.stack([of_channel.numpy()[:, at] for of_channel in of_cells], axis=1)
+            # A mirror blurs, cells do not.
+            off = 0.2 if horizon == "mirror" else 0.05
+            assert np.linalg.norm(got - expected) < off * np.linalg.norm(expected)
 
 
 @pytest.mark.slow

@@ -262,7 +262,8 @@ def planes(file: FilePath, pixels: np.ndarray, warnings: list[str]) -> tuple[np.
         values, alpha = values[..., :-1], np.clip(values[..., -1], 0, 1)
     if values.shape[2] == 1:
         values = values.repeat(3, axis=2)
-        warnings.append(f"{file}: read as grey")
+        if not any(line.endswith("read as grey") for line in warnings):  # of OpenEXR its reader says so
+            warnings.append(f"{file}: read as grey")
     if (negative := values < 0).any():
         warnings.append(f"{file}: {texels_are(negative, 'negative', unit='pixel')}: set to 0")
     return np.maximum(values, 0), alpha, top

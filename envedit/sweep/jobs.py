@@ -123,7 +123,8 @@ def read_jobs(path: FilePath) -> list[Job]:
 
 def _text(path):
     try:
-        return path.read_text(encoding="utf-8-sig")
+        with atomic_files.opened(path) as file:
+            return file.read().decode("utf-8-sig")
     except (OSError, ValueError) as error:
         raise ConfigError(f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})") from None
 

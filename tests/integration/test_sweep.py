@@ -494,6 +494,17 @@ def test_jobs_that_are_not_there_are_an_error(tmp_path, capsys):
         assert len(capsys.readouterr().err.splitlines()) == 1
 
 
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes here")
+def test_jobs_are_not_waited_for_at_a_pipe(tmp_path, capsys):
+    (tmp_path / "folder").mkdir()
+    for pipe in (tmp_path / "jobs.toml", tmp_path / "folder" / "a.toml"):
+        os.mkfifo(pipe)
+    with open(os.open(tmp_path / "jobs.toml", os.O_RDWR), "wb"):  # somebody may write
+        for path in (tmp_path / "jobs.toml", tmp_path / "folder"):
+            assert main([str(path), "--out", str(tmp_path / "out")]) == 2
+            assert "cannot be read (is no regular file)" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     "wrong", [["--workers", "0"], ["--threads", "-1"], ["--workers", "2", "--scheduler", "x"]]
 )

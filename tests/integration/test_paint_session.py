@@ -99,10 +99,11 @@ def test_the_gain_is_as_fine_as_the_configuration_asks(tmp_path):
 
 def test_advice_is_given_where_little_is_reached(painting):
     session, _ = painting
-    status = solved(painting, strokes=[DARK], rest="keep", freedom=0.0)
+    nothing = DARK | {"amount": 0.0}
+    status = solved(painting, strokes=[nothing, DARK], rest="keep", freedom=0.0)
     assert status["reached"] < 0.5
     told = status["advice"]
-    assert told["text"].startswith("stroke 1 (shadow) stays too bright") and "which stays" in told["text"]
+    assert told["text"].startswith("stroke 2 (shadow) stays too bright") and "which stays" in told["text"]
     follow, *placed = told["actions"]
     assert follow["change"] == {"rest": "follow"} and placed
     asked = session.solution.request

@@ -35,6 +35,10 @@ COLUMNS = 32
 """Most exact columns of T that a new map to be painted on gets at once."""
 
 
+LEAST_CHANGE = 0.5 / 255
+"""Change of a display value below which a stroke asks for nothing. Derived: no 8-bit value changes."""
+
+
 @dataclass(frozen=True)
 class Request:
     """What was painted.
@@ -145,8 +149,14 @@ class Solution:
         return Request(self.base, self.target, self.coverage)
 
     def coverages(self) -> list[np.ndarray]:
-        """Return how much each pixel is painted by each stroke, were it alone."""
-        return [self._on_views(self._bare, [one]).coverage for one in self.document.strokes]
+        """Return how much each pixel is painted by each stroke, were it alone: 0 by one that asks nothing."""
+        before, found = self.base, []
+        for stroke in self.document.strokes:
+            made = self._on_views(replace(self._bare, picture=before), [stroke])
+            changed = np.abs(tonemap(made.picture) - tonemap(before)).max() > LEAST_CHANGE
+            found.append(made.coverage * changed)
+            before = made.picture
+        return found
 
     def likelihood(self, hold_weight: float) -> tuple[np.ndarray, Likelihood]:
         """Return the weight of pixels where those without paint have one, and the likelihood of the paint."""

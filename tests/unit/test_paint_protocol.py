@@ -130,6 +130,20 @@ def test_painted_toml_is_what_was_given_and_what_was_painted(tmp_path):
     assert other.folder == tmp_path / "edit_out-2", "another map's painting would be overwritten"
 
 
+@pytest.mark.parametrize("scene", ["", "width = 48\n"])
+def test_a_painting_goes_on_under_the_preset_that_is_asked_for(tmp_path, scene):
+    file = tmp_path / "edit.toml"
+    file.write_text(f'[input]\nenvmap = "sunsky"\n[scene]\n{scene}')
+    opened = project.opened(str(file))
+    done = protocol.document({"strokes": [STROKE]})
+    opened.keep(done)
+    for preset in ("draft", None):
+        again = project.opened(str(file), preset=preset)
+        assert (again.folder, again.document) == (opened.folder, done)
+        assert again.settings.preset == (preset or "standard")
+        again.keep(done)
+
+
 def test_two_servers_do_not_paint_in_one_folder(tmp_path, capsys):
     pytest.importorskip("starlette")
     file = tmp_path / "edit.toml"

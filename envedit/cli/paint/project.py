@@ -185,14 +185,17 @@ def _without(table, *names, **more):
 
 
 def _continued(project):
-    """Go on from a ``painted.toml`` of the same scene and map; of another, in a folder beside it."""
+    """Go on from a ``painted.toml`` of the same scene and map, under this project's preset.
+
+    Of another scene or map, in a folder beside it.
+    """
     folder, tried = project.folder, 1
     settings = project.settings
     while (folder / NAME).exists():
         with contextlib.suppress(ConfigError):  # not ours to overwrite
-            before = config.load(folder / NAME)
+            before = config.load(folder / NAME, settings.preset)
             if before.scene == settings.scene and before.input.envmap == settings.input.envmap:
-                return replace(opened(str(folder / NAME)), base=project.base)
+                return replace(opened(str(folder / NAME), preset=settings.preset), base=project.base)
         tried += 1
         folder = project.folder.with_name(f"{project.folder.name}-{tried}")
     return replace(project, settings=_plain(settings, folder), folder=folder)

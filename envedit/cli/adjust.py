@@ -87,6 +87,11 @@ def _adjust(arguments, console):
     doctor.select()
     input_map = map_command.read(arguments.map, arguments, console)
     radiance, notes = adjusted(map_file.radiance_of(input_map), how)
+    width = radiance.shape[1]
+    if arguments.program and QUARTERS[arguments.program] * width % 4:
+        notes.append(
+            f"interpolated between columns for {arguments.program}: 4 does not divide the width, {width}"
+        )
     console.say(*notes)
     for name, file in files.items():
         if name == "background":

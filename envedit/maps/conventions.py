@@ -26,6 +26,7 @@ its axes for a direction (x, y, z) and its look-up:
 def turned_for(program: str, envmap: np.ndarray) -> np.ndarray:
     """Return a map (H, W, 3) as a program, one of :data:`QUARTERS`, expects it.
 
-    It is moved by whole columns, without a change of any value, where W is a multiple of 4.
+    It is moved by whole columns, without a change of any value, where the quarters are whole columns, and
+    interpolated linearly between columns elsewhere.
     """
     return latlong.rotate(envmap, -90.0 * QUARTERS[program])

@@ -113,6 +113,20 @@ def test_bad_options_are_one_line(options, code, says, rng, tmp_path, capsys, he
     assert says in err and len(err.splitlines()) == 1 and not (tmp_path / "a.exr").exists()
 
 
+@pytest.mark.parametrize(("program", "width", "said"), [
+    ("blender", 128, False), ("blender", 90, True), ("unreal", 90, False), ("usd", 90, False)
+])  # fmt: skip
+def test_what_is_interpolated_for_a_program_is_said(program, width, said, rng, capsys, here):
+    envmap = rng.random((width // 2, width, 3), dtype=np.float32)
+    images.write_exr("sky.exr", envmap)
+    assert adjust.main(["sky.exr", "--for", program]) == 0
+    turned, _ = images.load_envmap("sky_adjusted.exr")
+    assert np.isin(turned, envmap).all() != said
+    out = capsys.readouterr().out
+    line = f"interpolated between columns for {program}: 4 does not divide the width, {width}"
+    assert (line in out) == said
+
+
 def test_a_number_out_of_range_is_a_usage_error(capsys):
     with pytest.raises(SystemExit) as stop:
         adjust.main(["sky.hdr", "--horizon", "nan"])

@@ -133,6 +133,12 @@ def test_a_colour_is_given_as_numbers_or_as_on_a_display():
     assert StrokeList()([stroke]) == (stroke,)
 
 
+def test_a_shadow_on_a_highlight_far_above_white_leaves_it_white():
+    """A factor on radiance, which a display clips: as docs/painting.md says of the stroke."""
+    found = painted(grey(30.0, 16, 16), type="shadow", amount=0.95, rectangle=BOX, softness=0.0)
+    assert found[8, 8, 0] == pytest.approx(1.5) and (tonemap(found) == 1).all()
+
+
 def test_a_shadow_is_a_factor_on_radiance_and_light_adds_to_it():
     picture = grey(2.0, 64, 64)  # above display white: a factor all the same
     soft = {"type": "shadow", "ellipse": [0.5, 0.5, 0.3, 0.3], "softness": 0.2, "amount": 0.75}

@@ -7,6 +7,7 @@ import contextlib
 import os
 import re
 import shutil
+import threading
 import time
 
 import numpy as np
@@ -169,6 +170,27 @@ def test_paint_drag_undo_save_and_reopen(browser, file):
         sync_api.expect(page.get("undo")).to_be_enabled()
         assert "elevation" in page.get("handle-1").get_attribute("aria-label")
         assert not page.faults, page.faults
+
+
+def test_what_is_changed_after_a_save_has_begun_is_not_said_to_be_saved(browser, file):
+    with opened(browser, file) as (page, server, _):
+        session, changed, message = server.worker.session, threading.Event(), page.get("message")
+        carried_out = session._carried_out
+        session._carried_out = lambda *run: (changed.wait(60), carried_out(*run))[1]
+        page.settled(False)
+        page.get("save").click()
+        sync_api.expect(page.status).to_have_text(re.compile("^(Saving: |saving)"))
+        page.get("map-exposure").fill("1")
+        page.get("map-exposure").press("Enter")
+        page.page.wait_for_function("() => envedit.log.some((e) => e.edit && e.phase === 'done')")
+        changed.set()
+        sync_api.expect(message).to_contain_text(", without what was changed meanwhile: ", timeout=240_000)
+        page.settled(False)
+        page.get("save").click()
+        sync_api.expect(message).to_contain_text("Saved in edit_out: ", timeout=240_000)
+        page.get("map-exposure").fill("2")
+        page.get("map-exposure").press("Enter")
+        sync_api.expect(message).to_have_text("")
 
 
 def test_another_explanation_is_chosen(browser, file):
@@ -736,7 +758,7 @@ def test_fingers_paint_and_zoom_on_a_tablet(browser, file):
             "() => document.querySelector('.zoomed').style.transform.includes('scale')"
         )
         assert kept.read_text().count("[[target.strokes]]") == 1
-        for width, height in ((820, 1180), (1024, 768)):
+        for width, height in ((820, 1180), (1024, 768), (420, 800), (360, 640)):
             page.page.set_viewport_size({"width": width, "height": height})
             assert page.page.evaluate("document.documentElement.scrollWidth") == width
     context.close()

@@ -672,7 +672,8 @@ class Session:
         self.resting = True  # what is shown is what was saved
         files = [name for name in output_folder.names(folder) if (folder / name).is_file()]
         notes = [self._differs(shown, saved), *(note for note in result.notes if "target.hold =" in note)]
-        told = {"folder": folder.name, "files": files, "warnings": warnings, "notes": notes}
+        whose = {name: self.status[name] for name in ("number", "client")}
+        told = {"folder": folder.name, "files": files, "warnings": warnings, "notes": notes} | whose
         self.tell.say({"type": "saved", **told})
         return warnings
 

@@ -36,7 +36,7 @@ const frames = { render: [], map: [], difference: [], unreachable: [], before: [
 
 let view = 0, views = [], outlined = false;
 let thumbDue = false; // the picture of the present step is taken when it is drawn next
-let client = "", painting = 0, sent = 0, since = null, opened = false, last = {}, waiting = null, tool = "shadow", shape = "brush";
+let client = "", painting = 0, sent = 0, unedited = 0, since = null, opened = false, last = {}, waiting = null, tool = "shadow", shape = "brush";
 
 // ---- the document
 
@@ -66,7 +66,8 @@ function flush() {
   const message = { type: "document", number: ++sent, painting, ...waiting };
   if (!connection.send(message)) return; // sent again when the server is back
   note({ edit: sent, phase: waiting.phase, since });
-  if (waiting.phase === "done" && !$("message").classList.contains("good")) say(""); // what went wrong before
+  const { classList } = $("message");
+  if (waiting.phase === "done" && (classList.contains("saved") || !classList.contains("good"))) say(""); // it was of what is past
   since = null;
   waiting = null;
 }
@@ -187,6 +188,7 @@ const RECEIVED = {
     listed.white = message.white;
     opened = true;
     painting = message.painting;
+    unedited = sent; // the number of what is open
     if (mine) flush();
     say(message.again && !message.notes.length ? `Goes on from painted.toml of ${message.folder}` : message.notes.join("; "), true);
     refresh();
@@ -194,6 +196,7 @@ const RECEIVED = {
   thumbnail(message) { if (!opened) chooser.picture(message); },
   document(message) {
     lights.solo = -1;
+    if ($("message").classList.contains("saved")) say("");
     history.follow({ ...EMPTY, ...message.document }, !message.client);
     refresh();
   },
@@ -223,7 +226,9 @@ const RECEIVED = {
     say("", true);
     $("progress").hidden = true;
     const links = message.files.filter((name) => ["report.html", "edited.exr", "edited_full.exr", "edited_full.hdr", "lights.json", "look.toml"].includes(name));
-    $("message").replaceChildren(`Saved in ${message.folder}: `, ...links.flatMap((name) => [Object.assign(document.createElement("a"), { href: `result/${name}`, textContent: name, target: "_blank" }), " "]), ...[...message.notes, ...message.warnings].map((line) => `${line}. `));
+    $("message").classList.add("saved");
+    const older = { [client]: message.number, "": unedited }[message.client] < sent; // of another page's: false
+    $("message").replaceChildren(`Saved in ${message.folder}${older ? ", without what was changed meanwhile" : ""}: `, ...links.flatMap((name) => [Object.assign(document.createElement("a"), { href: `result/${name}`, textContent: name, target: "_blank" }), " "]), ...[...message.notes, ...message.warnings].map((line) => `${line}. `));
   },
   note(message) { say(message.text, true); },
   refused(message) { say(message.text); },
@@ -265,7 +270,7 @@ function state(name, text) {
 
 function say(text, good = false) {
   $("message").textContent = text ?? "";
-  $("message").classList.toggle("good", good);
+  $("message").className = good ? "good" : "";
 }
 
 // ---- painting

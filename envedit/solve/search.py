@@ -3,8 +3,8 @@
 An explanation is a local maximum of the posterior: the lights where they are, one of them elsewhere, softer
 or out, one more. No small step leads from one to the other. Each is begun with the sky's gain as in the
 original and the light where it promises most, descended to by a few Gauss-Newton steps, and judged by one
-number beside what lights cost. It is taken where that is worth more than a bare mention. Of a rendering the
-number is -2 log evidence in Laplace's approximation (MacKay 1992),
+number beside what lights cost. Of a rendering that is -2 log evidence in Laplace's approximation (MacKay
+1992),
 
     F(x) + 6 n log(sigma) + log det H - log det K,
 
@@ -135,9 +135,13 @@ def completed(problem: Problem, explanation: Explanation) -> Explanation:
 
 
 def _likelier(best, explanations):
-    """Return the likeliest of some explanations if there is evidence for it over the best, else None."""
+    """Return the likeliest of some explanations if it is likelier than the best so far, else None.
+
+    Where lights are where they were, they stay there unless there is evidence for another explanation.
+    """
     likeliest = min([best, *explanations], key=lambda one: one.score)
-    return likeliest if likeliest.score < best.score - POSITIVE_EVIDENCE else None
+    least = 0 if best.done else POSITIVE_EVIDENCE
+    return likeliest if likeliest.score < best.score - least else None
 
 
 def _others(best, compared):

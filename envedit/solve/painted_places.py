@@ -146,9 +146,8 @@ class _TriedLight:
             factors, unlikeliness = self._best(pictures, glow)
             at = int(np.argmin(unlikeliness))
             row, column = divmod(int(texels[at]), width)
-            direction = latlong.directions(height, width)[row, column]
-            glow = self.glow(direction)
-        factors, unlikeliness = self._best(pictures[at : at + 1], glow)
+        direction = latlong.directions(height, width)[row, column]
+        factors, unlikeliness = self._best(pictures[at : at + 1], self.glow(direction))
         return Place(direction, np.full(3, np.log(factors[0])), -float(unlikeliness[0]))
 
     def lobe(self, direction, degrees, glow):

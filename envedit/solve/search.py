@@ -110,7 +110,7 @@ def search(
         promising = [move for move in moves if move.gain > 0 or (move.light, move.what) in kinds]
         neighbours = _neighbours(problem, best, promising, after_step, steps, anew=True)
         compared += neighbours
-        better = _likelier(best, neighbours)
+        better = _likelier(problem, best, neighbours)
     return replace(best, others=_others(best, compared))
 
 
@@ -124,7 +124,8 @@ def further(
     point = gauss_newton.reached(problem, run)
     best = Explanation({}, run, point, score(problem, run, point))
     promising = [move for move in _moves(problem, best) if move.gain > 0]
-    return _likelier(best, _neighbours(problem, best, promising, after_step, EXPLANATION_STEPS, anew=False))
+    neighbours = _neighbours(problem, best, promising, after_step, EXPLANATION_STEPS, anew=False)
+    return _likelier(problem, best, neighbours)
 
 
 def completed(problem: Problem, explanation: Explanation) -> Explanation:
@@ -134,14 +135,20 @@ def completed(problem: Problem, explanation: Explanation) -> Explanation:
     return replace(explanation, run=run, point=point, score=score(problem, run, point))
 
 
-def _likelier(best, explanations):
-    """Return the likeliest of some explanations if it is likelier than the best so far, else None.
+def _likelier(problem, best, explanations):
+    """Return the likeliest of some explanations that are likelier than the best so far, None of none.
 
-    Where lights are where they were, they stay there unless there is evidence for another explanation.
+    Where lights are where they were, they stay there unless there is evidence for another explanation; so
+    they do where paint has put them.
     """
-    likeliest = min([best, *explanations], key=lambda one: one.score)
-    least = 0 if best.done else POSITIVE_EVIDENCE
-    return likeliest if likeliest.score < best.score - least else None
+    painted = problem.likelihood.painted
+
+    def least(one):
+        settled = not best.done or (painted and one.done == best.done)
+        return POSITIVE_EVIDENCE if settled else 0.0
+
+    likelier = [one for one in explanations if one.score < best.score - least(one)]
+    return min(likelier, key=lambda one: one.score, default=None)
 
 
 def _others(best, compared):

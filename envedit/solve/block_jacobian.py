@@ -126,6 +126,8 @@ class BlockJacobian:
         ``slope`` (rows, W, 3) is the derivative of the map by that factor.
         """
         _, centres = self.sky
+        count = len(centres)
+        centres = centres[::2]  # two that are side by side, 6 degrees apart, have one glow
         shape = len(self._toward), len(centres)
         cell, centre = np.divmod(np.arange(math.prod(shape), dtype=np.uint32), np.uint32(max(shape[1], 1)))
         around = glow(
@@ -135,7 +137,8 @@ class BlockJacobian:
         pictures = []
         for c, matrix in enumerate(self._matrix):
             factor = around[c].numpy().reshape(shape)
-            pictures.append(tensor((matrix * self._means(slope[..., c].ravel())) @ factor))
+            of_centres = (matrix * self._means(slope[..., c].ravel())) @ factor
+            pictures.append(tensor(np.repeat(of_centres, 2, axis=1)[:, :count]))
         return pictures
 
     def spread(self, covariance: np.ndarray) -> np.ndarray:

@@ -18,6 +18,7 @@ from envedit.core.arrays import flat, tensor
 from envedit.core.rotations import rotation_vector
 from envedit.losses import display_curve
 from envedit.representations.layers.aureoles import glow_strength
+from envedit.representations.layers.lights import LOBE_DEGREES
 from envedit.solve.light_places import (
     PLACES_APART_COSINE,
     PROBE_SPACINGS,
@@ -76,13 +77,10 @@ def best(
     places: list[Place] = []
     texels: list[np.ndarray] = []
     for at in most_promising(directions, -unlikeliness):
-        glow = trial.glow(directions[at])
-        texel = trial.texel(directions[at], glow)
-        if is_apart(texel.direction, texels):
-            texels.append(texel.direction)
-            larger = () if trial.own else LARGER_DEGREES
-            lobes = [trial.lobe(directions[at], degrees, glow) for degrees in larger]
-            places.append(_smallest([texel, *lobes]))
+        sizes = trial.sizes(directions[at])
+        if is_apart(sizes[0].direction, texels):
+            texels.append(sizes[0].direction)
+            places.append(_smallest(sizes))
     return places
 
 
@@ -135,23 +133,34 @@ class _TriedLight:
             picture -= np.float32(layers.ground_light.irradiance(core[: layers.shape[0]]) * self.ground)
         return picture.reshape(-1, 3)
 
-    def texel(self, direction, glow):
-        """Return the best texel around a direction, through exact columns; ``glow`` is that there."""
+    def sizes(self, direction):
+        """List the places at a direction, the best texel around it first; an added light may be larger."""
+        glow = self.glow(direction)
+        texel, core = self._texel(direction, glow)
+        larger = () if self.own else LARGER_DEGREES
+        cores = [core, *(self._lobe(direction, degrees) for degrees in larger)]
+        glows = None if glow is None else np.stack([self.glow(texel), *[glow] * len(larger)])
+        factors, unlikeliness = self._best(np.stack(cores), glows)
+        directions = [texel, *[direction] * len(larger)]
+        made = zip(directions, factors, unlikeliness, (LOBE_DEGREES, *larger), strict=True)
+        return [Place(d, np.full(3, np.log(f)), -float(u), degrees) for d, f, u, degrees in made]
+
+    def _texel(self, direction, glow):
+        """Return the direction of the best texel around one, through exact columns, and its picture."""
         height, width = self.problem.envmap.shape[:2]
         row, column = (round(float(x)) for x in latlong.texel_position(direction, height, width))
         for spacing in PROBE_SPACINGS:
             texels, pictures = probed(
                 self.problem, self.transport, row, column, self.flux, spacing, reach=1, ground=self.ground
             )
-            factors, unlikeliness = self._best(pictures, glow)
+            glows = None if glow is None else np.repeat(glow[None], len(texels), axis=0)
+            _, unlikeliness = self._best(pictures, glows)
             at = int(np.argmin(unlikeliness))
             row, column = divmod(int(texels[at]), width)
-        direction = latlong.directions(height, width)[row, column]
-        factors, unlikeliness = self._best(pictures[at : at + 1], self.glow(direction))
-        return Place(direction, np.full(3, np.log(factors[0])), -float(unlikeliness[0]))
+        return latlong.directions(height, width)[row, column], pictures[at]
 
-    def lobe(self, direction, degrees, glow):
-        """Return the place of a lobe of some radius, with a :meth:`glow` there."""
+    def _lobe(self, direction, degrees):
+        """Return the picture (pixels, 3) of the core of a lobe of some radius."""
         layers = self.problem.layers
         turn = rotation_vector(layers.lights.centres[self.k], direction)
         placement = turn, np.zeros(3), layers.lights.log_size(degrees)
@@ -160,15 +169,12 @@ class _TriedLight:
         if self.ground is not None:
             light = layers.ground_light.irradiance(core[0, : layers.shape[0]])
             picture += np.float32(light * self.ground)
-        factors, unlikeliness = self._best(picture.reshape(1, -1, 3), glow)
-        return Place(direction, np.full(3, np.log(factors[0])), -float(unlikeliness[0]), degrees)
+        return picture.reshape(-1, 3)
 
-    def _best(self, pictures, glow):
-        """Return the best factors of the flux of cores (k, pixels, 3), and -2 log likelihood then."""
-        glows = None
-        if glow is not None:
-            glows = [tensor(np.repeat(one[:, None], len(pictures), axis=1)) for one in glow.T]
-        return self._compared.best([tensor(one) for one in pictures.T], glows)
+    def _best(self, cores, glows):
+        """Return the best factors of the flux of lights, and -2 log likelihood then; (k, pixels, 3) both."""
+        by_channels = None if glows is None else [tensor(one) for one in glows.T]
+        return self._compared.best([tensor(one) for one in cores.T], by_channels)
 
 
 @dataclass(frozen=True)

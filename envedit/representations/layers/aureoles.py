@@ -4,10 +4,9 @@ A glow G is measured as a factor of the sky around a light (``separation.py``). 
 with s times its flux, it is f(s) c(d) G, with f(s) = 2 s / (1 + s) and c(d) = min(1, M(d_0) / M(d)): d_0 is
 where the light was, M(d) the mean radiance of the background under G around d, per channel. A glow is light
 of the sun that air has scattered. Before bright clouds or at a bright horizon it is therefore no brighter in
-itself, c, nor of another colour.
-It is gone with its light, but of a brighter sun it is hardly brighter: on eight PureSky maps, whose suns have
-0.06 to 25 times the irradiance of their skies, the glow at 10 degrees goes with the flux to the power of 0.12
-(``python -m experiments natural.aureoles run``).
+itself, c, nor of another colour. It is gone with its light, but of a brighter sun it is hardly brighter: on
+eight PureSky maps, whose suns have 0.06 to 25 times the irradiance of their skies, the glow at 10 degrees
+goes with the flux to the power of 0.12 (``python -m experiments natural.aureoles run``).
 """
 
 from __future__ import annotations

@@ -55,7 +55,11 @@ class BlockJacobian:
         used = np.bincount(self._cell, minlength=cells) > 0
         self._used = np.flatnonzero(used)
         self._hats = np.concatenate(hats, axis=1)[used].astype(np.float32)
-        self._matrix = [np.ascontiguousarray(m[:, used]) for m in overview.matrix]
+        # Products leave out cells whose light does not reach the picture: half of them above a floor.
+        self._reaching = np.flatnonzero(used & overview.matrix.any(axis=(0, 1)))
+        self._reaching_hats = self._hats[np.searchsorted(self._used, self._reaching)]
+        self._overview = overview.matrix
+        self._matrix = [np.ascontiguousarray(m[:, self._reaching]) for m in overview.matrix]
         self._tensors = [tensor(m) for m in self._matrix]
         # Where in the sky is what the texels of a cell follow.
         toward = latlong.directions(*shape)[layers.active]
@@ -74,7 +78,7 @@ class BlockJacobian:
         """Return the change of a block's radiance by each node, (blocks, n), per channel."""
         channels = []
         for c, matrix in enumerate(self._tensors):
-            hats = tensor(self._means(slopes[:, c])[:, None] * self._hats)
+            hats = tensor(self._means(slopes[:, c])[:, None] * self._reaching_hats)
             channels.append(dr.matmul(matrix, hats).numpy())
         return channels
 
@@ -87,9 +91,9 @@ class BlockJacobian:
         return of_pixels.transpose(1, 2, 0)
 
     def _means(self, values):
-        """Return the means over the cells in use of values of texels, (rows * W,), float32."""
+        """Return the means over the cells of :attr:`_matrix` of values of texels, (rows * W,), float32."""
         sums = np.bincount(self._cell, self._omega * values, self._cells)
-        return (sums / np.maximum(self._total, 1e-30))[self._used].astype(np.float32)
+        return (sums / np.maximum(self._total, 1e-30))[self._reaching].astype(np.float32)
 
     def profile(self, picture: np.ndarray) -> np.ndarray:
         """Return a picture (h, w, 3) over its mean in every block; 1 where that is 0."""
@@ -103,8 +107,9 @@ class BlockJacobian:
     def _lit(self):
         """Pictures of unit flux in each cell of the sky, (blocks, n), per channel."""
         cells, _ = self.sky
-        size = np.maximum(self._total[self._used[cells]], 1e-30)
-        return [tensor(m[:, cells] / np.float32(size)) for m in self._matrix]
+        cells = self._used[cells]
+        size = np.maximum(self._total[cells], 1e-30)
+        return [tensor(m[:, cells] / np.float32(size)) for m in self._overview]
 
     def cells(self, ground: np.ndarray | None = None) -> CellLights:
         """Return pictures of light in each cell of :attr:`sky`.
@@ -135,9 +140,9 @@ class BlockJacobian:
             dr.gather(mi.Vector3f, vectors(mi.Vector3f, centres), mi.UInt32(centre)),
         )
         pictures = []
-        for c, matrix in enumerate(self._matrix):
-            factor = around[c].numpy().reshape(shape)
-            of_centres = (matrix * self._means(slope[..., c].ravel())) @ factor
+        for c, matrix in enumerate(self._tensors):
+            change = self._means(slope[..., c].ravel())[:, None] * around[c].numpy().reshape(shape)
+            of_centres = dr.matmul(matrix, tensor(change)).numpy()
             pictures.append(tensor(np.repeat(of_centres, 2, axis=1)[:, :count]))
         return pictures
 

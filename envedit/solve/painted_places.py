@@ -40,6 +40,8 @@ ADDED_FLUX_SHARES, ADDED_FLUXES = (1 / 64, 2.0), 15
 light in the picture, and by what it adds alone."""
 LARGER_DEGREES = (2.0, 8.0)
 """Radii of larger lights that are tried: what is painted into something smooth is as large as its image."""
+ROWS_OF_A_LANE = 64
+"""Pixels, or blocks of them, that are summed up one after the other: so few that all cores are busy."""
 POSITIVE_EVIDENCE = 2.0
 """Difference of -2 log likelihood up to which two places promise as much as each other: "not worth more than
 a bare mention" (Kass and Raftery 1995)."""
@@ -225,9 +227,16 @@ class _Comparison:
         Squares times :attr:`weight`, (f, k), and values times :attr:`share`, (f, k, 3).
         """
         count, k = cores[0].shape
-        column, end, width = dr.arange(mi.UInt32, k), dr.opaque(mi.UInt32, count), dr.opaque(mi.UInt32, k)
-        strengths = [flat(mi.Float, glow_strength(row)) for row in factors]
-        factors = [flat(mi.Float, row) for row in factors]
+        parts = -(-count // ROWS_OF_A_LANE)  # a lane is one light and some rows
+        lane, end, width = dr.arange(mi.UInt32, parts * k), dr.opaque(mi.UInt32, count), dr.opaque(mi.UInt32, k)
+        part = lane // width
+        column = lane - part * width
+        first = part * dr.opaque(mi.UInt32, ROWS_OF_A_LANE)
+        stop = dr.minimum(first + dr.opaque(mi.UInt32, ROWS_OF_A_LANE), end)
+        strengths, factors = (
+            [dr.gather(mi.Float, flat(mi.Float, row), column) for row in some]
+            for some in (glow_strength(factors), factors)
+        )
         before = flat(mi.Float, np.float32(self.before))
         goal = display_curve.to_display(tensor(self.target), self.likelihood.white).array
         white = dr.opaque(mi.Float, self.likelihood.white)
@@ -248,8 +257,10 @@ class _Comparison:
                     means[3 * i + c] = means[3 * i + c] + mi.Float64(part * off)
             return row + 1, squares, means
 
-        begun = mi.UInt32(0), [mi.Float64(0)] * len(factors), [mi.Float64(0)] * (3 * len(factors))
-        _, squares, means = dr.while_loop(begun, lambda row, *_: row < end, add)
+        begun = first, [mi.Float64(0)] * len(factors), [mi.Float64(0)] * (3 * len(factors))
+        _, squares, means = dr.while_loop(begun, lambda row, *_: row < stop, add)
         dr.eval(squares, means)
-        squares, means = (np.stack([one.numpy() for one in some]) for some in (squares, means))
+        squares, means = (
+            np.stack([one.numpy().reshape(parts, k).sum(axis=0) for one in some]) for some in (squares, means)
+        )
         return squares, means.reshape(-1, 3, k).transpose(0, 2, 1)

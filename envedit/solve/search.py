@@ -59,6 +59,7 @@ class Explanation:
     run: gauss_newton.Run
     point: Point
     score: float  # -2 log evidence, but for a constant
+    latest: int | None = None  # light that the last move has placed
     # Of the likeliest that :func:`search` finds: the next ones, each of another :attr:`name`
     others: tuple[Explanation, ...] = ()
 
@@ -177,7 +178,8 @@ def _neighbours(problem, best, moves, after_step, steps, anew):
         if anew:
             run = gauss_newton.Run(_under_original_sky(move.state), move.centre)
         done = move.after(best.done, problem.layers.lights.own)
-        neighbours.append(_descended(problem, done, run, best.point.transport, steps, likeliest))
+        reached = _descended(problem, done, run, best.point.transport, steps, likeliest)
+        neighbours.append(replace(reached, latest=move.light))
         likeliest = min(likeliest, neighbours[-1].score)
         after_step()
     return neighbours
@@ -336,7 +338,8 @@ def _under_the_original(problem, best):
         # ---- elsewhere
         away = problem.direction(state, k)
         cost = _cost_of_choice(problem) if own and not start["turn"][k].any() else 0.0
-        for there in painted_places.best(problem, dark, transport, k, away):
+        placed = k == best.latest  # all else is as it was when its place was looked for
+        for there in () if placed else painted_places.best(problem, dark, transport, k, away):
             moved = _put(lights, state, k, there)
             centre = with_light(start, k, turn=moved["turn"][k]) if own else _put(lights, start, k, there)
             yield _Move(k, MOVED, moved, centre, gain=now + there.promise - cost)
@@ -349,7 +352,7 @@ def _under_the_original(problem, best):
             centre = with_light(start, spare, turn=turn, flux=flux, size=size)
             yield _Move(k, SOFTENED, soft, centre, gain=now - _unlikeliness(problem, soft, transport))
         # ---- out, if it was added
-        if not own:
+        if not (own or placed):
             gain = now - _unlikeliness(problem, dark, transport) + ADDED_LIGHT_COST
             yield _Move(k, REMOVED, dark, start, gain)
 

@@ -227,12 +227,13 @@ class _Comparison:
         Squares times :attr:`weight`, (f, k), and values times :attr:`share`, (f, k, 3).
         """
         count, k = cores[0].shape
-        parts = -(-count // ROWS_OF_A_LANE)  # a lane is one light and some rows
-        lane, end, width = dr.arange(mi.UInt32, parts * k), dr.opaque(mi.UInt32, count), dr.opaque(mi.UInt32, k)
+        parts = -(-count // ROWS_OF_A_LANE)
+        lane = dr.arange(mi.UInt32, parts * k)  # of one light, and some rows
+        width = dr.opaque(mi.UInt32, k)
         part = lane // width
         column = lane - part * width
         first = part * dr.opaque(mi.UInt32, ROWS_OF_A_LANE)
-        stop = dr.minimum(first + dr.opaque(mi.UInt32, ROWS_OF_A_LANE), end)
+        stop = dr.minimum(first + dr.opaque(mi.UInt32, ROWS_OF_A_LANE), dr.opaque(mi.UInt32, count))
         strengths, factors = (
             [dr.gather(mi.Float, flat(mi.Float, row), column) for row in some]
             for some in (glow_strength(factors), factors)

@@ -57,6 +57,25 @@ def test_a_light_goes_where_it_is_put_with_its_flux(sky):
     assert out.max() < 0.2 * sky.max() and np.isfinite(out).all()
 
 
+@pytest.mark.parametrize("size", [2.0, 5.0])
+def test_a_light_that_grows_is_not_torn_into_rows(size, sky):
+    placed = PlacedLights(sky)
+    entry = {"light": 1, "flux": [1.0] * 3, "size": size}
+    grown = placed.place([entry])
+    assert np.allclose(flux(grown), flux(sky), rtol=0.05)
+    lights = [placed.params([entry | {"flux": [f] * 3}]) for f in (1.0, 0.0)]
+    torn = np.subtract(*(placed.layers.parts(one)[1].numpy() for one in lights))
+    whole = grown - placed.place([entry | {"flux": [0.0] * 3}])
+
+    def rises(core):
+        """Count rows that are darker than one on either side, and by how much flux."""
+        rows = core.sum(axis=(1, 2))
+        above, below = np.maximum.accumulate(rows), np.maximum.accumulate(rows[::-1])[::-1]
+        return (np.minimum(above, below) - rows).max() / rows.max()
+
+    assert rises(whole) < 0.05 < 0.1 < rises(torn)  # its glow lights the ground, which is darker far away
+
+
 @on_cpu
 @pytest.mark.parametrize("horizon", ["mirror", "keep", "free"])
 def test_lights_are_placed_as_without_any_gain(horizon, sky):

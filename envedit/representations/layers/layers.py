@@ -419,9 +419,11 @@ class Layers:
         log_glow = self._image(dr.log(factor)).numpy()
         return log_glow if self.below is None else np.concatenate([log_glow, log_glow[self.below.mirrored]])
 
-    def cores_of(self, i: int, placements: Sequence[tuple[np.ndarray, np.ndarray, float]]) -> np.ndarray:
+    def cores_of(
+        self, i: int, placements: Sequence[tuple[np.ndarray, np.ndarray, float]], half_row: float = 1.0
+    ) -> np.ndarray:
         """Return what :meth:`.Lights.cores_of` does of light ``i``, (k, rows, W, 3), without what is kept."""
-        above = self.lights.cores_of(i, placements, self.shape)
+        above = self.lights.cores_of(i, placements, self.shape, half_row)
         low = self.whole[0] - self.shape[0]
         cores = np.pad(above, ((0, 0), (0, low), (0, 0), (0, 0)))
         return cores if self.kept is None else cores * self.changeable

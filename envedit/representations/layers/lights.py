@@ -186,12 +186,16 @@ class Lights:
         return shared_out(row, column, half, flux, 1.0, shape, self._rows)
 
     def cores_of(
-        self, i: int, placements: Sequence[tuple[np.ndarray, np.ndarray, float]], shape: tuple[int, int]
+        self,
+        i: int,
+        placements: Sequence[tuple[np.ndarray, np.ndarray, float]],
+        shape: tuple[int, int],
+        half_row: float = 1.0,
     ) -> np.ndarray:
         """Render the core of light ``i`` alone as it is placed in one way and another, (k, rows, W, 3).
 
-        ``placements`` are turn, log flux and log size, as of :meth:`core`, as is ``shape``. Linear radiance;
-        not differentiable.
+        ``placements`` are turn, log flux and log size, as of :meth:`core`, as is ``shape``; ``half_row`` is
+        as of :func:`shared_out`. Linear radiance; not differentiable.
         """
         # ---- Every point of the light once for each placement
         first, count = self._points_of[i]
@@ -213,7 +217,7 @@ class Lights:
 
         # ---- One image for each placement
         row, column, half = placed(position, centre, turn, size, wide, (self.total, self.width))
-        cores = shared_out(row, column, half, flux, 1.0, shape, self._rows, mi.Int32(page), pages)
+        cores = shared_out(row, column, half, flux, half_row, shape, self._rows, mi.Int32(page), pages)
         return cores.numpy().reshape(-1, *shape, 3)
 
     def glow(self, turn: mi.TensorXf, log_flux: mi.TensorXf, d: mi.Vector3f) -> mi.Color3f:

@@ -21,7 +21,7 @@ from envedit.core.rotations import rotation_vector
 from envedit.images import map_regions
 from envedit.representations.layers import below_horizon, light_images
 from envedit.representations.layers.layers import Layers
-from envedit.representations.layers.lights import log_flux_of
+from envedit.representations.layers.lights import DARK, log_flux_of
 from envedit.representations.layers.unseen import unseen_kept
 
 ADDED_LEAST_TEXELS = 0.6
@@ -81,12 +81,30 @@ class PlacedLights:
         """
         envmap = self.envmap
         if any("light" in light for light in placed):
-            params = self.params(placed)
-            lights = {name: value for name, value in params.items() if not name.startswith("gain.")}
-            envmap = unseen_kept(envmap, self.layers.decode(lights).numpy())
+            envmap = unseen_kept(envmap, self._moved(placed))
         envmap = add(envmap, [light for light in placed if "light" not in light])
         require_radiance(envmap, "input.lights", brightest=BRIGHTEST)
         return envmap
+
+    def _moved(self, placed):
+        """Return the map with its own lights as entries place them."""
+        params = self.params(placed)
+        lights = {name: value for name, value in params.items() if not name.startswith("gain.")}
+        sky, core = (part.numpy() for part in self.layers.parts(lights))
+
+        # ---- Points of lights that have grown lie apart in rows too, and are as wide as that there
+        scales = self.layers.scales
+        turn, log_flux, log_size = (lights[name].numpy() * scales[name] for name in ("turn", "flux", "size"))
+        grown = [i for i, (size,) in enumerate(log_size) if size > 0]
+        if grown:
+            others = log_flux.copy()
+            others[grown] = DARK
+            _, core = self.layers.parts(lights | {"flux": tensor(others / scales["flux"])})
+            core = core.numpy()
+        for i in grown:
+            size = float(log_size[i, 0])
+            core += self.layers.cores_of(i, [(turn[i], log_flux[i], size)], half_row=float(np.exp(size)))[0]
+        return sky + core
 
     def locking(self, placed: Sequence[dict], kept: np.ndarray | None) -> tuple[dict, ...]:
         """Return the entries, with those lights locked that stand where the map is kept, (H, W).

@@ -27,7 +27,7 @@ import numpy as np
 from envedit.core.rotations import rotation_vector
 from envedit.representations.layers.lights import DARK, log_flux_of
 from envedit.solve import gauss_newton, painted_places
-from envedit.solve.light_places import Places
+from envedit.solve.light_places import Place, Places
 from envedit.solve.likelihood import INDEPENDENT
 from envedit.solve.map_problem import LARGEST_STEP, Problem
 from envedit.solve.painted_places import POSITIVE_EVIDENCE
@@ -59,7 +59,9 @@ class Explanation:
     run: gauss_newton.Run
     point: Point
     score: float  # -2 log evidence, but for a constant
-    latest: int | None = None  # light that the last move has placed
+    # latest, rivals: light that the last move has placed, and places that promised less; of paint alone
+    latest: int | None = None
+    rivals: tuple[Place, ...] = ()
     # Of the likeliest that :func:`search` finds: the next ones, each of another :attr:`name`
     others: tuple[Explanation, ...] = ()
 
@@ -79,6 +81,7 @@ class _Move:
     state: dict
     centre: dict
     gain: float
+    rivals: tuple[Place, ...] = ()  # places of the light that promise less
 
     def after(self, done: dict[int, str], own: int) -> dict[int, str]:
         """Return what is done to lights with this move beside earlier ones; ``own`` lights are the map's."""
@@ -179,7 +182,7 @@ def _neighbours(problem, best, moves, after_step, steps, anew):
             run = gauss_newton.Run(_under_original_sky(move.state), move.centre)
         done = move.after(best.done, problem.layers.lights.own)
         reached = _descended(problem, done, run, best.point.transport, steps, likeliest)
-        neighbours.append(replace(reached, latest=move.light))
+        neighbours.append(replace(reached, latest=move.light, rivals=move.rivals))
         likeliest = min(likeliest, neighbours[-1].score)
         after_step()
     return neighbours
@@ -339,10 +342,12 @@ def _under_the_original(problem, best):
         away = problem.direction(state, k)
         cost = _cost_of_choice(problem) if own and not start["turn"][k].any() else 0.0
         placed = k == best.latest  # all else is as it was when its place was looked for
-        for there in () if placed else painted_places.best(problem, dark, transport, k, away):
+        places = list(best.rivals) if placed else painted_places.best(problem, dark, transport, k, away)
+        for there in places:
             moved = _put(lights, state, k, there)
             centre = with_light(start, k, turn=moved["turn"][k]) if own else _put(lights, start, k, there)
-            yield _Move(k, MOVED, moved, centre, gain=now + there.promise - cost)
+            gain = now + there.promise - cost
+            yield _Move(k, MOVED, moved, centre, gain, _rivals(there, places))
         # ---- softer: a light of few texels cannot grow, as its texels would part; a lobe can
         if own and spare is not None:
             flux = state["flux"][k] + log_flux_of(lights.flux[k] / lights.flux[spare])
@@ -357,9 +362,16 @@ def _under_the_original(problem, best):
             yield _Move(k, REMOVED, dark, start, gain)
 
     # ---- one more, as large as it must be
-    for there in () if spare is None else painted_places.best(problem, state, transport, spare):
+    places = [] if spare is None else painted_places.best(problem, state, transport, spare)
+    for there in places:
         more, centre = (_put(lights, one, spare, there) for one in (state, start))
-        yield _Move(spare, ADDED, more, centre, gain=now + there.promise - ADDED_LIGHT_COST)
+        gain = now + there.promise - ADDED_LIGHT_COST
+        yield _Move(spare, ADDED, more, centre, gain, _rivals(there, places))
+
+
+def _rivals(there, places):
+    """Return the places that are not tried beside one, as they promise less."""
+    return tuple(one for one in places if one.promise < there.promise - POSITIVE_EVIDENCE)
 
 
 def _under_original_sky(state):

@@ -144,6 +144,21 @@ def test_a_painting_goes_on_under_the_preset_that_is_asked_for(tmp_path, scene):
         again.keep(done)
 
 
+def test_a_painting_goes_on_with_what_its_configuration_says_now(tmp_path):
+    file = tmp_path / "edit.toml"
+    text = '[input]\nenvmap = "sunsky"\nwidth = {}\n'
+    file.write_text(text.format(64))
+    opened = project.opened(str(file))
+    done = protocol.document({"strokes": [STROKE]})
+    opened.keep(done, start="painted.npz")
+    same = project.opened(str(file))
+    assert (same.document, Path(same.start).name) == (done, "painted.npz")
+    file.write_text(text.format(32) + "[target]\nhold = 2\n")
+    other = project.opened(str(file))
+    assert (other.document, other.folder, other.start) == (done, opened.folder, "")
+    assert (other.settings.input.width, other.settings.target.hold) == (32, 2)
+
+
 def test_two_servers_do_not_paint_in_one_folder(tmp_path, capsys):
     pytest.importorskip("starlette")
     file = tmp_path / "edit.toml"

@@ -142,7 +142,7 @@ def on_another_map(before: Project, document: Document, envmap: str) -> Project:
     added = tuple(light for light in document.lights if "light" not in light)
     document = replace(document, lights=added)
     settings = replace(before.settings, input=given)
-    return _continued(Project(settings, before.folder, before.base, document))
+    return _continued(Project(settings, before.folder, before.base, document), its_own=True)
 
 
 def _of_photo(settings, base):
@@ -184,10 +184,10 @@ def _without(table, *names, **more):
     return type(table)(**kept | more)
 
 
-def _continued(project):
-    """Go on from a ``painted.toml`` of the same scene and map, under this project's preset.
+def _continued(project, its_own=False):
+    """Go on from a ``painted.toml`` of the same scene and map, with this project's preset and settings.
 
-    Of another scene or map, in a folder beside it.
+    Of another scene or map, in a folder beside it. ``its_own``: with the settings of that painting.
     """
     folder, tried = project.folder, 1
     settings = project.settings
@@ -195,7 +195,12 @@ def _continued(project):
         with contextlib.suppress(ConfigError):  # not ours to overwrite
             before = config.load(folder / NAME, settings.preset)
             if before.scene == settings.scene and before.input.envmap == settings.input.envmap:
-                return replace(opened(str(folder / NAME), preset=settings.preset), base=project.base)
+                painting = opened(str(folder / NAME), preset=settings.preset)
+                if its_own:
+                    return replace(painting, base=project.base)
+                again = replace(painting, settings=_plain(settings, folder), base=project.base)
+                same = again.text(again.document) == painting.text(painting.document)
+                return again if same else replace(again, start="")
         tried += 1
         folder = project.folder.with_name(f"{project.folder.name}-{tried}")
     return replace(project, settings=_plain(settings, folder), folder=folder)

@@ -206,7 +206,7 @@ def painted_verdict(measured: dict) -> str:
     """Say how far a painted picture was followed: ``towards``, ``reachable``, ``elsewhere`` of a run."""
     if measured["towards"] is None:
         return "the painted change is below the noise of the renderings"
-    line = f"{100 * measured['towards']:.0f} % of the painted change reached"
+    line = f"{round(100 * measured['towards'])} % of the painted change reached"
     if measured["reachable"] is not None:
         line += f" ({100 * measured['reachable']:.0f} % feasible)"
     if measured["elsewhere"] is not None:

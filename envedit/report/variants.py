@@ -42,7 +42,7 @@ class Variant:
         """One phrase for a note: what was done, and what it reaches."""
         if self.towards is None:
             return self.name
-        return f"{self.name} ({100 * self.towards:.0f} % of the painted change)"
+        return f"{self.name} ({round(100 * self.towards)} % of the painted change)"
 
     @property
     def measures(self) -> dict:

@@ -230,9 +230,9 @@ class _Comparison:
         parts = -(-count // ROWS_OF_A_LANE)
         lane = dr.arange(mi.UInt32, parts * k)  # of one light, and some rows
         width = dr.opaque(mi.UInt32, k)
-        part = lane // width
-        column = lane - part * width
-        first = part * dr.opaque(mi.UInt32, ROWS_OF_A_LANE)
+        slab = lane // width
+        column = lane - slab * width
+        first = slab * dr.opaque(mi.UInt32, ROWS_OF_A_LANE)
         stop = dr.minimum(first + dr.opaque(mi.UInt32, ROWS_OF_A_LANE), dr.opaque(mi.UInt32, count))
         strengths, factors = (
             [dr.gather(mi.Float, flat(mi.Float, row), column) for row in some]

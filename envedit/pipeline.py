@@ -412,8 +412,11 @@ class _Edit:
         if len(self.scene.views) > 1:
             views = [{"name": view.name, **self._compared(view.rows)} for view in self.scene.views]
             self.metrics["views"] = views
-        if self.metrics["painted"]:
-            self.metrics["painted"]["reachable"] = self.feasible.share if self.feasible else None
+        painted = self.metrics["painted"]
+        if painted:
+            painted["reachable"] = None
+            if self.feasible:  # estimated from below: what was reached is feasible
+                painted["reachable"] = max(self.feasible.share, painted["towards"] or 0.0)
         if self.target.envmap is not None:
             initial, target, edited = (
                 self.maps[name][self.rows.slice] for name in ("initial", "target", "edited")

@@ -137,6 +137,19 @@ def test_the_ratio_to_the_sky_and_the_flux_are_as_asked(tmp_path, capsys):
     capsys.readouterr()
 
 
+def test_a_light_in_a_black_sky_gets_what_is_asked_for(tmp_path, capsys):
+    black = np.zeros((64, 128, 3), np.float32)
+    black[20:22, 40:43] = 1
+    assert of_file(tmp_path, black, "--flux", "5") == 0
+    flux = json.loads(capsys.readouterr().out)["flux"]
+    assert luminance(np.array(flux)) == pytest.approx(5) and min(flux) > 1
+    out = images.read(tmp_path / "out.exr")[0].astype(np.float64)
+    omega = latlong.lookup_solid_angles(64, 128)[:, None, None]
+    assert luminance((out * omega).sum(axis=(0, 1))) == pytest.approx(5, rel=0.02)
+    assert of_file(tmp_path, black, "--ratio", "3", "--overwrite") == 0
+    assert json.loads(capsys.readouterr().out)["ratio"] == pytest.approx(3)
+
+
 @pytest.mark.parametrize("option", ["--flux", "--ratio"])
 def test_in_a_sky_that_is_clipped_all_over_a_sun_has_the_colour_of_the_analytic_one(option, tmp_path, capsys):
     white = np.full((32, 64, 3), 0.5, np.float32)

@@ -144,8 +144,11 @@ def is_clipped(light: ClippedLight, flux: np.ndarray) -> bool:
 
 
 def coloured(light: ClippedLight, flux: float) -> np.ndarray:
-    """Return a flux (3,) of a luminance in the colour of a light."""
-    return flux * _unit(estimate(light).flux)
+    """Return a flux (3,) of a luminance in the colour of a light; under a black sky in an analytic sun's."""
+    colour = estimate(light).flux
+    if not colour.any():
+        colour, _ = analytic_fluxes(light.elevation)
+    return flux * _unit(colour)
 
 
 def flux_of_ratio(light: ClippedLight, ratio: float) -> float:

@@ -15,18 +15,19 @@ from envedit.core import file_locks
 from envedit.core.errors import EnveditError, InputError
 from envedit.core.types import FilePath, Views
 
+COMPLETE, CHECKPOINT = "metrics.json", "checkpoint.npz"
+"""Files of a run that is complete, and of one that may go on."""
 RESULTS = (
-    "metrics.json", "edited.exr", "edited.hdr", "edited_full.exr", "edited_full.hdr", "edited_layers.exr",
+    COMPLETE, "edited.exr", "edited.hdr", "edited_full.exr", "edited_full.hdr", "edited_layers.exr",
     "edited_sky.exr", "edited_lights.exr", "lights.json", "look.toml", "edited.xml", "edited.usda",
     "render_initial.exr", "render_target.exr", "render_edited.exr", "influence.exr", "influence.png",
     "unreachable.png", "photograph.png",
     "preview.png", "report.html", "history.csv", "config.toml", "manifest.json", "given_envmap.exr",
-    "given_target_map.exr", "given_target.exr", "given_mask.exr", "variants", "checkpoint.npz",
+    "given_target_map.exr", "given_target.exr", "given_mask.exr", "variants", CHECKPOINT,
 )  # fmt: skip
-"""What a run may leave in its folder, beside the files of single views (:func:`names`); the last only while
-it runs.
+"""What a run may leave in its folder, beside the files of single views (:func:`names`).
 
-The first says that a run is complete: whoever moves them away moves it first of all.
+Whoever moves them away moves :data:`COMPLETE` first of all.
 """
 _NUMBERED = re.compile(r"render_(initial|target|edited)_\d+\.exr")  # of one view among several
 EARLIER = "earlier"
@@ -45,9 +46,9 @@ def of_views(name: str, views: Views) -> list[tuple[str, slice]]:
 
 
 def names(folder: Path) -> tuple[str, ...]:
-    """Return :data:`RESULTS`, with the numbered renderings that are in a folder before the last."""
+    """Return :data:`RESULTS`, and the numbered renderings that are in a folder."""
     numbered = sorted(path.name for path in folder.glob("render_*.exr") if _NUMBERED.fullmatch(path.name))
-    return (*RESULTS[:-1], *numbered, RESULTS[-1])
+    return (*RESULTS, *numbered)
 
 
 def inputs_of(settings: config.Config, base: Path | None = None) -> Iterator[FilePath]:
@@ -117,7 +118,7 @@ def results_in(
     """Make a folder for results, as :func:`alone`, and move what an earlier run left there to ``earlier-N``.
 
     InputError if an input lies where a result would go, or the folder cannot be used. Of the results'
-    ``names`` the first, which says that a run is complete, is moved first, and the last is a checkpoint's.
+    ``names`` the first, which says that a run is complete, is moved first.
     After an error of the user's before any result is written, what was moved is moved back.
 
     ``inputs`` are what the run reads, and must not be moved; they are looked at where the folder holds any
@@ -158,7 +159,7 @@ def _set_aside(folder, names, inputs, keep, spare):
         raise InputError(f"{mine[0]}: this input lies where its own results would go: use another folder")
 
     # ---- What is moved or copied
-    if keep and {folder / names[0], folder / names[-1]} & set(old):
+    if keep and {folder / COMPLETE, folder / CHECKPOINT} & set(old):
         return []
     spared = {os.path.realpath(path) for path in spare}
     copied = [path for path in old if os.path.realpath(path) in spared]

@@ -353,8 +353,8 @@ class _Edit:
             edited, samples, noise = self.scene.sampled(self.edited, spp, self.seeds.judged)
             self.samples = samples
             self.noise = noise
-            self.unedited = self._rendered(self.original)
-            initial = self.unedited if target.initial is None else target.initial
+            unedited = self._rendered(self.original)
+            initial = unedited if target.initial is None else target.initial
             self.renders = {"initial": initial, "target": target.picture, "edited": edited}
             self.maps = {"initial": self.original, "target": target.envmap, "edited": self.edited}
             # Pictures that differ by noise alone: of the target's map, or of the one that was painted on.
@@ -362,7 +362,7 @@ class _Edit:
             if target.envmap is not None:
                 self.ceiling = self._rendered(target.envmap), target.picture
             elif target.initial is not None:
-                self.ceiling = self.unedited, target.initial
+                self.ceiling = unedited, target.initial
             by_hand = self.settings.input.orientation
             layers = self.job.representation if self.job else None
             moves = layers.light_moves(self.params) if isinstance(layers, Layers) else []
@@ -448,13 +448,11 @@ class _Edit:
     def compare_photograph(self):
         """Set the camera of the metrics, and the pixels that the light does not explain."""
         photo = self.target.photo
-        likelihood = replace(Likelihood.of_target(self.target), least_noise=SIGMA)
-        residual = photo.missed(self.renders["edited"])
-        of_rendering = 0.0 if self.noise is None else self.noise
-        deviations = sizes(residual)[..., 0] / np.hypot(likelihood.noise(residual), of_rendering)
-        self.outliers = (deviations > OUTLIER_DEVIATIONS) & (likelihood.weight[..., 0] > 0)
+        self.outliers = self._unexplained(photo.missed(self.renders["edited"]))
         share = float(self.outliers.mean()) / float((self.target.weight > 0).mean())
         self.metrics["camera"] = {**photo.measures, "outliers": share}
+
+        # ---- What is said of it
         if photo.aligns and not photo.recognised:
             line = "target.file: its outlines are not clearly those of the scene: is it of this view?"
             self.warnings.append(line)
@@ -464,6 +462,13 @@ class _Edit:
             line += "irradiance, or target.exposure fixes it"
         self.notes.append(line)
         self.notes.append(f"{100 * share:.3g} % of the photograph's pixels are not explained by light")
+
+    def _unexplained(self, residual):
+        """Return where the residual of a photograph (h, w, 3) is beyond what is known, bool (h, w)."""
+        likelihood = replace(Likelihood.of_target(self.target), least_noise=SIGMA)
+        of_rendering = 0.0 if self.noise is None else self.noise
+        deviations = sizes(residual)[..., 0] / np.hypot(likelihood.noise(residual), of_rendering)
+        return (deviations > OUTLIER_DEVIATIONS) & (likelihood.weight[..., 0] > 0)
 
     def _compared(self, rows, views=()):
         """Compare rows of the renderings with those of the target."""

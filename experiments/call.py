@@ -22,7 +22,7 @@ from envedit import config
 from envedit.cli import doctor
 from envedit.cli.sweep import exit_code
 from envedit.core.atomic_files import write_atomically
-from envedit.report.manifest import plain
+from envedit.report.plain_files import plain
 from envedit.sweep.process import CONFIG
 
 RESULT = "result.json"

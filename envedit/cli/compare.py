@@ -32,7 +32,7 @@ def _compare(arguments, console):
     from envedit.core.atomic_files import write_atomically
     from envedit.images.images import png
     from envedit.maps import compared
-    from envedit.report import manifest, output_folder, preview
+    from envedit.report import output_folder, plain_files, preview
 
     # ---- The maps and what is measured of them
     doctor.select()
@@ -56,7 +56,7 @@ def _compare(arguments, console):
     about = f"log2 of luminance of {stems[1]} over {stems[0]}; red: brighter; full colour: {scale:g} stops"
     with output_folder.results_in(folder, RESULTS, [arguments.first, arguments.second]):
         write_atomically(folder / "difference.png", png(difference, {"Description": about}))
-        manifest.write_json(folder / "compare.json", measured)
+        plain_files.write_json(folder / "compare.json", measured)
     files = {name: str(folder / name) for name in RESULTS}
     console.facts |= {"folder": str(folder), "files": files, **measured}
     console.say(*_lines(measured))

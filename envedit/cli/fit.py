@@ -63,7 +63,7 @@ def _fit(arguments, settings, original, folder, console):
     from envedit import inputs
     from envedit.images import images
     from envedit.losses import metrics
-    from envedit.report import manifest, preview
+    from envedit.report import plain_files, preview
     from envedit.representations.siren import fit
 
     rows = inputs.active_rows(settings.input.rows, original.shape[0])
@@ -102,7 +102,7 @@ def _fit(arguments, settings, original, folder, console):
         "seconds": round(fitted.seconds, 2),
         "cached": fitted.cached,
     }
-    manifest.write_json(folder / "fit.json", numbers)
+    plain_files.write_json(folder / "fit.json", numbers)
     log_psnr = "undefined" if fitted.log_psnr is None else f"{fitted.log_psnr:.1f}"
     peak_ratio = "undefined" if fitted.peak_ratio is None else f"{fitted.peak_ratio:.2f}"
     seconds = f"{fitted.seconds:.1f} s{' (kept from an earlier run)' if fitted.cached else ''}"

@@ -32,7 +32,7 @@ def main(argv: list[str] | None = None) -> int:
 def _lights(arguments, console):
     from envedit.images import images
     from envedit.maps import map_lights
-    from envedit.report import manifest, output_folder
+    from envedit.report import output_folder, plain_files
     from envedit.representations.layers import file_lights
 
     # ---- The lights, in Rec. 709 and in the colours of the file
@@ -57,7 +57,7 @@ def _lights(arguments, console):
         marks = {"source": arguments.map}
         images.write_exr(folder / "sky.exr", sky, marks, chromaticities=input_map.chromaticities)
         images.write_exr(folder / "lights.exr", alone, marks, chromaticities=input_map.chromaticities)
-        manifest.write_json(folder / "lights.json", about)
+        plain_files.write_json(folder / "lights.json", about)
     files = {name: str(folder / name) for name in RESULTS}
     console.facts |= {"folder": str(folder), "files": files, **about}
     console.say(*_table(numbered))

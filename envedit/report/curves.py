@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from envedit.losses.optimizer import ramp
-from envedit.report.manifest import columns
+from envedit.report.plain_files import columns
 
 PALETTE = ("#22223b", "#c8553d", "#2a7f9e", "#588157", "#b5838d", "#8d6a9f", "#d4a017", "#6c757d")
 DECADES = 12

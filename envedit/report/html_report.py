@@ -20,7 +20,7 @@ from envedit.core.types import FilePath
 from envedit.report import html_parts as parts
 from envedit.report import preview
 from envedit.report.curves import curves_svg, escape, normalised
-from envedit.report.manifest import plain
+from envedit.report.plain_files import plain
 from envedit.report.verdict import verdict
 
 if TYPE_CHECKING:

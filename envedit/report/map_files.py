@@ -14,7 +14,7 @@ from envedit.core.errors import InputError
 from envedit.export import light_list
 from envedit.images import images
 from envedit.maps import look_transfer, looks, map_file, usd_scene
-from envedit.report import manifest
+from envedit.report import plain_files
 from envedit.scene import scene
 from envedit.scene.usd import conversion
 
@@ -46,7 +46,7 @@ def write_lights(folder: Path, result: results.Result) -> None:
     sky, lights = light_list.split(result.envmap, result.input_map.as_stored(result.core))
     images.write_exr(folder / "edited_sky.exr", sky, source, chromaticities=space)
     images.write_exr(folder / "edited_lights.exr", lights, source, chromaticities=space)
-    manifest.write_json(folder / "lights.json", result.lights)
+    plain_files.write_json(folder / "lights.json", result.lights)
 
 
 def write_look(folder: Path, result: results.Result) -> list[str]:

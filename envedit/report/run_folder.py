@@ -16,7 +16,7 @@ from envedit.core.errors import InputError, NumericalError
 from envedit.export import file_resolution
 from envedit.images import images
 from envedit.losses.perceptual import installed
-from envedit.report import html_report, manifest, map_files, output_folder, preview, variants
+from envedit.report import html_report, manifest, map_files, output_folder, plain_files, preview, variants
 from envedit.solve import checkpoint
 
 if TYPE_CHECKING:
@@ -44,15 +44,15 @@ def write(folder: Path, result: results.Result, import_s: float) -> list[str]:
 
     # ---- What explains the run later
     atomic_files.write_atomically(folder / "config.toml", config.to_toml(settings).encode())
-    manifest.write_history(folder / "history.csv", result.history)
+    plain_files.write_history(folder / "history.csv", result.history)
     facts = manifest.manifest(
         {"seed": settings.seed, "preset": settings.preset}, _inputs(result), settings.variant
     )
-    manifest.write_json(folder / "manifest.json", facts)
+    plain_files.write_json(folder / "manifest.json", facts)
 
     # ---- The report, which shows the time but for its own, and names what metrics.json will lack
     lost: list[str] = []
-    manifest.plain(result.metrics, "", lost)
+    plain_files.plain(result.metrics, "", lost)
     result.warnings += [f"metrics.json: {name} was not finite and is null" for name in lost]
     timing = result.metrics["timing"]
     timing["full_s"] = round(maps_written - start, 3)
@@ -66,7 +66,7 @@ def write(folder: Path, result: results.Result, import_s: float) -> list[str]:
     timing["total_s"] = round(timing["total_s"] + timing["report_s"], 3)
 
     # ---- metrics.json, which says that the run is complete, and what is no longer needed
-    manifest.write_json(folder / "metrics.json", result.metrics)
+    plain_files.write_json(folder / "metrics.json", result.metrics)
     checkpoint.remove(folder)
     output_folder.tidy(folder)
     return result.warnings

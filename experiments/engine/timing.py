@@ -10,7 +10,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from envedit.report.manifest import manifest, plain
+from envedit.report.manifest import manifest
+from envedit.report.plain_files import plain
 
 REPEATS = 7
 WARM_UP = 3  # a first call compiles; a second may still see other literals

@@ -31,6 +31,7 @@ from envedit.representations.layers.layers import Layers
 from envedit.results import Result
 from envedit.scene.renderings import rendered
 from envedit.solve import adam_loop, adam_solver, feasibility
+from envedit.solve.checkpoint import Checkpoints
 from envedit.solve.edit_state import Interrupted, Stopped, Watch
 from envedit.solve.likelihood import SIGMA, Likelihood, sizes
 from envedit.targets import working_size
@@ -75,12 +76,12 @@ def run(
     checkpoint, where there is one, is of the last step that was kept. Stopped if the optimisation cannot go
     on.
     """
-    edit = _Edit(settings, folder, base, watch or Watch(), replacements)
+    edit = _Edit(settings, base, watch or Watch(), replacements)
     try:
         edit.load()
         if edit.to_solve:
             edit.prepare()
-            edit.solve(resume)
+            edit.solve(Checkpoints(folder, resume, settings.optimizer.checkpoint_s))
         else:
             edit.leave()
         edit.adjust()
@@ -149,14 +150,13 @@ class _Edit:
     degrees = 0.0
     level = 1.0
 
-    def __init__(self, settings, folder, base, watch, replacements):
+    def __init__(self, settings, base, watch, replacements):
         self.begun = time.perf_counter()
         self.clock = _Clock()
         networks = installed.load(settings)
         self.settings = networks.settings
         self.dists = networks.dists
         self.lpips = networks.lpips
-        self.folder = folder
         self.base = base
         self.watch = watch
         self.replacements = replacements
@@ -255,13 +255,12 @@ class _Edit:
             self.small,
             self.map,
             self.rows,
-            self.folder,
             self.watch,
             self.dists,
             self.clock,
         ).traced()
 
-    def solve(self, resume):
+    def solve(self, checkpoints):
         """Find the map that explains the target."""
         solver = "gauss-newton" if self.job.newton else "adam"
         no_step = self.job.settings is not self.settings
@@ -269,9 +268,9 @@ class _Edit:
         with self.clock("edit_s"):
             self.watch.stage("editing")
             if self.job.newton:
-                self.params, self.state = self.solver.optimise(resume)
+                self.params, self.state = self.solver.optimise(checkpoints)
             else:
-                self.params, self.state = adam_solver.optimise(self.job, self.solver.params, resume)
+                self.params, self.state = adam_solver.optimise(self.job, self.solver.params, checkpoints)
             self.transport = self.job.renderer.transport
             self.edited = self.solved_map = self.job.decode(self.params)
         photo = self.target.photo

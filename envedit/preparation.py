@@ -11,7 +11,6 @@ import math
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
@@ -52,7 +51,6 @@ class Preparation:
     scene: Scene  # what is lit
     map: InputMap  # what is edited; where it is locked or kept, the sky is not turned
     rows: Rows  # its active rows
-    folder: Path | None  # of the checkpoint
     watch: Watch  # receives progress
     dists: distances.Dists | None  # as for :class:`.edit_state.EditState`
     clock: Callable[[str], AbstractContextManager]  # ``with clock(name):`` adds up seconds
@@ -211,7 +209,6 @@ class Preparation:
             target=target,
             representation=representation,
             renderer=self.renderer,
-            folder=self.folder,
             watch=self.watch,
             dists=self.dists,
             degrees=degrees,

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import time
-
 import numpy as np
 
 from envedit.core.arrays import tensor
@@ -20,8 +18,10 @@ quickstart, four representations at rates of 0.1 to 1e38: it is 0.02 to 1.7, or 
 1e6 times the first."""
 
 
-def optimise(edit: EditState, params: Params, resume: bool) -> tuple[Params, adam_loop.State]:
-    """Optimise from the start, or from the checkpoint where there is one and ``resume`` asks for it.
+def optimise(
+    edit: EditState, params: Params, checkpoints: checkpoint.Checkpoints
+) -> tuple[Params, adam_loop.State]:
+    """Optimise from the start, or from the checkpoint where the run is resumed and there is one.
 
     ``params`` is where to start. A resumed run takes its target's picture from the checkpoint.
 
@@ -37,7 +37,7 @@ def optimise(edit: EditState, params: Params, resume: bool) -> tuple[Params, ada
     adam = adam_loop.adam_for(edit.representation, params, settings)
     state = adam_loop.State()
     digest = checkpoint.digest(edit.settings, edit.scene.digest, [edit.original, *edit.target.asked])
-    if edit.folder and resume and (stored := checkpoint.load(edit.folder, digest)):
+    if stored := checkpoints.load(digest):
         state, moments, traced, picture = stored
         adam.load_state_dict(moments)
         edit.renderer.restore(traced)
@@ -54,20 +54,16 @@ def optimise(edit: EditState, params: Params, resume: bool) -> tuple[Params, ada
         views=edit.scene.rows,
     )
     objective.resume(state.history)
-    saved = time.perf_counter()
 
     # ---- Steps
     with ctrl_c() as interrupt:
 
         def after_step(state, adam):
-            nonlocal saved
             edit.watch.progress(state.step, settings.iterations, f"loss {state.history[-1]['loss']:.4g}")
-            due = time.perf_counter() - saved >= settings.checkpoint_s
-            due |= state.step == settings.iterations  # what follows may be interrupted too
-            if edit.folder and (due or interrupt.is_set()):
+            done = state.step == settings.iterations  # what follows may be interrupted too
+            if checkpoints.due(done or interrupt.is_set()):
                 traced = edit.renderer.state()
-                checkpoint.save(edit.folder, digest, state, adam.state_dict(), traced, edit.target.aim)
-                saved = time.perf_counter()
+                checkpoints.save(digest, state, adam.state_dict(), traced, edit.target.aim)
             if interrupt.is_set():
                 raise Interrupted(_last_good(edit, adam), state.step)
 

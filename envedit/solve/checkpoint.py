@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import time
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -35,6 +36,33 @@ def digest(settings: config.Config, scene: str, inputs: list[np.ndarray]) -> str
     for array in inputs:
         sha.update(np.ascontiguousarray(array).tobytes())
     return sha.hexdigest()
+
+
+class Checkpoints:
+    """Where a run leaves its state now and then, every so many ``seconds``; nowhere without a ``folder``.
+
+    With ``resume`` it goes on from what was left there.
+    """
+
+    def __init__(self, folder: Path | None, resume: bool, seconds: float):
+        self.folder = folder
+        self.resume = resume
+        self.seconds = seconds
+        self._saved = time.perf_counter()
+
+    def load(self, what: str) -> tuple[State, dict, dict, np.ndarray] | None:
+        """Return what :func:`load` does, where the run is to go on from it; None otherwise."""
+        return load(self.folder, what) if self.folder and self.resume else None
+
+    def due(self, last: bool) -> bool:
+        """Whether to :meth:`save` after a step, at the latest after the ``last``."""
+        return self.folder is not None and (last or time.perf_counter() - self._saved >= self.seconds)
+
+    def save(self, what: str, state: State, optimiser: dict, renderer: dict, picture: np.ndarray) -> None:
+        """Save as :func:`save` does, where there is a folder."""
+        if self.folder is not None:
+            save(self.folder, what, state, optimiser, renderer, picture)
+            self._saved = time.perf_counter()
 
 
 def save(folder: Path, what: str, state: State, optimiser: dict, renderer: dict, picture: np.ndarray) -> None:

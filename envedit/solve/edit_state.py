@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -73,7 +72,6 @@ class EditState:
     # representation, renderer: as for :func:`.adam_loop.optimise`; of layers more than the protocol is used
     representation: Any
     renderer: Renderer
-    folder: Path | None  # of the checkpoint
     watch: Watch  # receives progress
     dists: distances.Dists | None = None  # as for :class:`.adam_loop.Objective`
     degrees: float = 0.0  # by how much the map has been turned

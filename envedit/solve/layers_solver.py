@@ -17,7 +17,6 @@ the path-traced rendering that meets the target.
 from __future__ import annotations
 
 import itertools
-import time
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -116,7 +115,7 @@ class LayersSolver:
 
     # ---- Steps ---------------------------------------------------------------------------------------------
 
-    def optimise(self, resume: bool) -> tuple[Params, adam_loop.State]:
+    def optimise(self, checkpoints: checkpoint.Checkpoints) -> tuple[Params, adam_loop.State]:
         """Make Gauss-Newton steps from :attr:`begun` or the map as it is, or from the checkpoint.
 
         Raises
@@ -130,7 +129,7 @@ class LayersSolver:
         edit, run = self.edit, self.begun
         settings = edit.settings.optimizer
         digest = checkpoint.digest(edit.settings, edit.scene.digest, [edit.original, *edit.target.asked])
-        if edit.folder and resume and (stored := checkpoint.load(edit.folder, digest)):
+        if stored := checkpoints.load(digest):
             state, arrays, _, picture = stored
             if edit.target.photo is not None:
                 edit.target = edit.target.developed(edit.target.photo.of_array(arrays.pop("photo")))
@@ -140,11 +139,11 @@ class LayersSolver:
 
         # ---- Runs, one from where the last has ended
         with ctrl_c() as interrupt:
-            keep = _Checkpoints(edit, digest, interrupt)
+            watched = _Watched(edit, checkpoints, digest, interrupt)
             while True:
                 # Paint is no noisy picture, and asks for what it shows.
                 sparing = not (edit.target.painted or (run and run.corrected))
-                solution = self._steps(edit.problem(), run, sparing, settings.iterations, keep.after_step)
+                solution = self._steps(edit.problem(), run, sparing, settings.iterations, watched.after_step)
                 following = self._following(solution, interrupt)
                 if following is None:
                     break
@@ -266,26 +265,24 @@ class LayersSolver:
         return float((np.square(missed) * target.known_weight).mean())
 
 
-class _Checkpoints:
-    """Reports steps, writes checkpoints when they are due, and ends the edit after Ctrl-C."""
+class _Watched:
+    """Reports steps, saves them when that is due, and ends the edit after Ctrl-C."""
 
-    def __init__(self, edit, digest, interrupt):
-        self.edit, self.digest, self.interrupt = edit, digest, interrupt
-        self.saved = time.perf_counter()
+    def __init__(self, edit, checkpoints, digest, interrupt):
+        self.edit, self.checkpoints = edit, checkpoints
+        self.digest, self.interrupt = digest, interrupt
 
     def after_step(self, run, point):
         edit, settings, done = self.edit, self.edit.settings.optimizer, len(run.history)
         most = min(settings.iterations, gauss_newton.MOST_STEPS)
         if done:
             edit.watch.progress(done, max(most, done), f"loss {run.history[-1]['loss']:.4g}")
-        due = time.perf_counter() - self.saved >= settings.checkpoint_s
-        due |= run.finished or done >= most  # what follows may be interrupted too
-        if edit.folder and (due or self.interrupt.is_set()):
+        last = run.finished or done >= most  # what follows may be interrupted too
+        if self.checkpoints.due(last or self.interrupt.is_set()):
             state = adam_loop.State(step=done, history=run.history)
             arrays = run.arrays() | {"aim": edit.target.aim}
             if edit.target.photo is not None:
                 arrays["photo"] = edit.target.photo.array
-            checkpoint.save(edit.folder, self.digest, state, arrays, {}, edit.target.picture)
-            self.saved = time.perf_counter()
+            self.checkpoints.save(self.digest, state, arrays, {}, edit.target.picture)
         if self.interrupt.is_set():
             raise Interrupted(point.edited, done)

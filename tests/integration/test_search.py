@@ -110,6 +110,21 @@ def test_a_shadow_that_was_painted_elsewhere_moves_the_sun(transport):
     assert angle(problem.direction(found.run.start, 0), DIRECTIONS[ELSEWHERE]) < 8
 
 
+def test_a_light_is_looked_for_again_once_another_has_changed(transport, monkeypatch):
+    """Not the one that was just placed: all else is as it was when its place was found."""
+    problem, start = moved(transport, ELSEWHERE)
+    places, lights = painted_places.best, []
+
+    def best(problem, state, transport, k, away=None):
+        lights.append(k)
+        return places(problem, state, transport, k, away)
+
+    monkeypatch.setattr(painted_places, "best", best)
+    assert search.search(problem, start).name == "light 1 moved"
+    own, spare = 0, problem.layers.lights.own
+    assert lights == [own, spare, spare]
+
+
 def test_what_was_tried_before_changes_nothing(transport):
     """F and an explanation are of the problem alone: columns of T that others have traced do not count."""
     problem, start = moved(transport, ELSEWHERE)

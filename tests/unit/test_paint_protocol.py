@@ -152,11 +152,12 @@ def test_a_painting_goes_on_with_what_its_configuration_says_now(tmp_path):
     done = protocol.document({"strokes": [STROKE]})
     opened.keep(done, start="painted.npz")
     same = project.opened(str(file))
-    assert (same.document, Path(same.start).name) == (done, "painted.npz")
+    assert (same.document, Path(same.start).name, same.note) == (done, "painted.npz", "")
     file.write_text(text.format(32) + "[target]\nhold = 2\n")
     other = project.opened(str(file))
     assert (other.document, other.folder, other.start) == (done, opened.folder, "")
     assert (other.settings.input.width, other.settings.target.hold) == (32, 2)
+    assert "Goes on from painted.toml of edit_out" in other.note
 
 
 def test_two_servers_do_not_paint_in_one_folder(tmp_path, capsys):

@@ -38,6 +38,7 @@ class Project:
     start: str = ""  # file of the solution that was saved of the document, "" where it has changed since
     # The run that makes the map: it matches a photograph. None without one, and where it is done
     photo: config.Config | None = None
+    note: str = ""  # what a user should know
 
     def configured(self, document: Document, start: str = "") -> config.Config:
         """Return the configuration that makes the map of a document; arguments as of :meth:`text`."""
@@ -199,8 +200,10 @@ def _continued(project, its_own=False):
                 if its_own:
                     return replace(painting, base=project.base)
                 again = replace(painting, settings=_plain(settings, folder), base=project.base)
-                same = again.text(again.document) == painting.text(painting.document)
-                return again if same else replace(again, start="")
+                if again.text(again.document) == painting.text(painting.document):
+                    return again
+                note = f"Goes on from {NAME} of {folder.name}, with the configuration's present settings"
+                return replace(again, start="", note=note)
         tried += 1
         folder = project.folder.with_name(f"{project.folder.name}-{tried}")
     return replace(project, settings=_plain(settings, folder), folder=folder)

@@ -119,7 +119,7 @@ class Session:
         self.scene, solved_on = self._films(inputs.load_scene(settings.scene, project.base))
         self._stage("reading the map")
         self.given = inputs.read_map(settings.input, self.scene, settings.input.width)
-        self.notes = self.given.warnings
+        self.notes = [*filter(None, [project.note]), *self.given.warnings]
         source = Path(settings.input.envmap)
         matched = source.name == MATCHED
         # In the scene's radiance
